@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from calib.procedure.excitation.settings import ExcitationSettings, PlanSettings
     from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
     from calib.procedure.session.commands import new_session
+    from calib.results.registry import open_result
+    from calib.results.result import Result
     from calib.robot.calibrated import CalibratedChain
 
 # what `import calib` offers, and where it lives: loaded when first asked for, so that `calib --help` starts at once
@@ -50,6 +52,8 @@ _HOMES = {
     "procedure.session.commands": ("new_session",),
     "apps.fleet.fleet": ("run_sessions",),
     "robot.calibrated": ("CalibratedChain",),
+    "results.registry": ("open_result",),
+    "results.result": ("Result",),
     "apps.compensation.api": ("compensate", "JointCommands"),
     "apps.joining.joining": ("join",),
     "apps.monitoring.comparison.robot_change": ("diff",),
@@ -77,6 +81,7 @@ __all__ = [  # noqa: RUF022 (in the order of use)
     "methods",
     "validate",
     "export",
+    "open_result",
     "compensate",
     "new_session",
     "run_sessions",
@@ -87,6 +92,7 @@ __all__ = [  # noqa: RUF022 (in the order of use)
     "MotionPlan",
     "DynamicsModel",
     "JointCommands",
+    "Result",
     "SelectionSettings",
     "FitSettings",
     "ExcitationSettings",

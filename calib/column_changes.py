@@ -18,6 +18,9 @@ Data = TypeVar("Data")
 
 # Ratio of the residuals of two changes up to which nobody can tell which of them it is (our choice).
 MAX_RIVAL_RATIO = 1.2
+# Ratio up to which two changes explain the data equally but for rounding: a wrist joint's zero off by 180° reverses the
+# joint behind it. The change that stands first in the table counts (our choice).
+MAX_TIE_RATIO = 1.0001
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +97,8 @@ def best_changes(
 ) -> Explanation | None:
     """Return the changes that explain the data best, chosen one by one; None if no change is significant.
 
+    Of changes that explain the data equally the first of the table counts.
+
     Args:
         data: as recorded.
         table: the changes to try.
@@ -116,9 +121,10 @@ def best_changes(
                     significant.append(_Trial(share, change, residual_after))
         if not significant:
             break
-        significant.sort(key=lambda trial: trial.share)
-        best = significant[0]
-        rivals = [trial.change for trial in significant[1:] if trial.share < MAX_RIVAL_RATIO * best.share]
+        least = min(trial.share for trial in significant)
+        best = next(trial for trial in significant if trial.share <= MAX_TIE_RATIO * least)
+        remaining = sorted((trial for trial in significant if trial is not best), key=lambda trial: trial.share)
+        rivals = [trial.change for trial in remaining if trial.share < MAX_RIVAL_RATIO * best.share]
         rival = rivals[0] if rivals and not changes else None
         data = best.change.make(data)
         residual = best.residual

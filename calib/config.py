@@ -16,7 +16,7 @@ from inspect import cleandoc
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
 
-from calib.config_types import UNKNOWN, Hidden, ParsedTable, shown
+from calib.config_types import UNKNOWN, Hidden, OneOf, ParsedTable, shown
 from calib.errors import CalibError, UsageError, suggestion
 
 if TYPE_CHECKING:
@@ -38,6 +38,8 @@ _PLAIN = {
     "tuple": "a list",
     "too_short": "at least one number",
 }
+# Stands in a field's description for the texts that it may hold instead of its default.
+OTHERS = "{others}"
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 # Entry of a docstring: names, and their description.
 _ENTRY = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.M)
@@ -102,7 +104,7 @@ def parse(kind: type[T], table: object, where: str, error: type[CalibError] = Us
     try:
         return _adapter(kind).validate_python(table)
     except ValidationError as validation_error:
-        raise error(_complaint(validation_error.errors(include_url=False), kind, where)) from None
+        raise error(_complaint(validation_error.errors(include_url=False), kind, where, table)) from None
 
 
 def read(kind: type[T], source: Tables | None, name: str, foreign_tables: Collection[str] = ()) -> tuple[T, str]:
@@ -149,8 +151,12 @@ def schema(kind: type, title: str) -> ParsedTable:
     """Return the JSON schema (draft 2020-12) of files for the dataclass `kind`."""
     from pydantic.json_schema import GenerateJsonSchema
 
-    json_schema = _adapter(kind).json_schema()
-    return {"$schema": GenerateJsonSchema.schema_dialect, **_for_toml(json_schema), "title": title}
+    json_schema = _for_toml(_adapter(kind).json_schema())
+    # pydantic knows the docstring of the class alone, not those of the classes it extends
+    for key, description in described(kind).items():
+        if key in json_schema["properties"]:
+            json_schema["properties"][key].setdefault("description", description)
+    return {"$schema": GenerateJsonSchema.schema_dialect, **json_schema, "title": title}
 
 
 def _for_toml(json_schema: object) -> Any:
@@ -171,7 +177,8 @@ def _for_toml(json_schema: object) -> Any:
                     continue
                 result[key][name] = _for_toml(item)
                 if key == "properties" and name in descriptions:
-                    result[key][name] |= {"description": descriptions[name]}
+                    others = [word for word in item.get("enum", ()) if word != item.get("default")]
+                    result[key][name] |= {"description": descriptions[name].replace(OTHERS, ", ".join(others))}
         elif key == "description" and isinstance(value, str):
             result[key] = value.partition("\n\nAttributes:")[0]
         elif key == "default" and value not in (None, [None]):  # None of a list: infinity, which JSON does not have
@@ -225,7 +232,20 @@ def described(source: object) -> dict[str, str]:
     descriptions: dict[str, str] = {}
     for base in reversed(getattr(source, "__mro__", (source,))):
         descriptions |= _entries(base.__doc__ or "")
+    for name, text in descriptions.items():
+        if OTHERS in text:
+            descriptions[name] = text.replace(OTHERS, ", ".join(_others(source, name)))
     return descriptions
+
+
+def _others(kind: type, key: str) -> list[str]:
+    """Return the texts that a key may hold instead of its default, in their order."""
+    default = getattr(kind, key)
+    hint = get_type_hints(kind, include_extras=True)[key]
+    for annotation in hint.__metadata__:
+        if isinstance(annotation, OneOf):
+            return [word for word in annotation.names if word != default]
+    return []
 
 
 def _entries(docstring: str) -> dict[str, str]:
@@ -253,22 +273,41 @@ def check_keys(
             raise error(f"{where}: {_no_key(key, keys)}")
 
 
-def located(loc: Sequence[int | str]) -> str:
-    """Return a file location in TOML notation: ``sigma.position``, ``files."a.csv".kind``, ``[[term]] number 2``."""
+def located(loc: Sequence[int | str], table: object = None) -> str:
+    """Return a file location in TOML notation: ``sigma.position``, ``files."a.csv".kind``, ``[[term]] number 2``.
+
+    Args:
+        loc: keys, and indices in lists.
+        table: the file's content; tables in lists are named besides: ``[[joint]] number 2 ('elbow')``.
+    """
     result = ""
+    content = table
     for k, part in enumerate(loc):
+        content = _content(content, part)
         if isinstance(part, int):
             if k + 1 < len(loc) or k == 1:
                 result = f"[[{result}]] number {part + 1}"
+                name = _content(content, "name")
+                if isinstance(name, str):
+                    result = f"{result} ({shown(name)})"
             continue
         name = part if _BARE.fullmatch(part) else f'"{part}"'
         if not result:
             result = name
-        elif k > 1 and result[-1] in "0123456789":
+        elif k > 1 and isinstance(loc[k - 1], int):
             result = f"{result}, {name}"
         else:
             result = f"{result}.{name}"
     return result
+
+
+def _content(table: Any, key: Any) -> Any:
+    """Return the value under a key of a table or at an index of a list; None where there is none."""
+    if isinstance(table, Mapping):
+        return table.get(key)
+    if isinstance(table, (list, tuple)) and isinstance(key, int) and key < len(table):
+        return table[key]
+    return None
 
 
 def _no_key(key: str, keys: Collection[str]) -> str:
@@ -276,14 +315,14 @@ def _no_key(key: str, keys: Collection[str]) -> str:
     return f"there is no key '{key}'{suggestion(key, keys)}; {choices}"
 
 
-def _complaint(errors: "list[ErrorDetails]", kind: type, source: str) -> str:
+def _complaint(errors: "list[ErrorDetails]", kind: type, source: str, parsed_table: object) -> str:
     """Return the message for pydantic's first error; an unknown key takes precedence over a missing one."""
     unknown = [error for error in errors if error["type"] == UNKNOWN]
     first = unknown[0] if unknown else errors[0]
     loc, name, value = tuple(first["loc"]), first["type"], first["input"]
 
     def message(location: Sequence[int | str], text: str) -> str:
-        where = ": ".join(filter(None, (source, located(location))))
+        where = ": ".join(filter(None, (source, located(location, parsed_table))))
         return f"{where}: {text}"
 
     if name in ("missing", "too_long"):

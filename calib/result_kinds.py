@@ -1,12 +1,14 @@
 """Kinds of results on disk: how a folder is recognised, what made it, and what a verb says that does not take it.
 
 Every verb that takes a result (`calib view`, `certificate`, `export`, `diff` …) refuses others by `refusal`, so that
-the message says what the folder is, and which folder or command to use instead.
+the message says what the folder is, and which folder or command to use instead. What a result of each kind can do is
+in `calib.results`.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from zipfile import BadZipFile, ZipFile
 
 from calib.folders import METRICS, OFFSETS, PARAMETERS, SESSION
 
@@ -18,14 +20,35 @@ class ResultKind:
     Attributes:
         name: what `kind_of` is compared with.
         noun: what a folder of this kind is, with its article.
-        marks: sets of files, each of which identifies the kind.
+        marks: sets of files, each of which identifies a folder of this kind.
         advice: verb → what to do instead, a clause with ``{folder}``.
+        companion: of a kind that is a file: how the name of the file beside it goes on after its stem.
+        array: of a kind that is an archive of arrays: one that only this kind has.
     """
 
     name: str
     noun: str
-    marks: tuple[tuple[str, ...], ...]
+    marks: tuple[tuple[str, ...], ...] = ()
     advice: Mapping[str, str] = field(default_factory=dict)
+    companion: str = ""
+    array: str = ""
+
+    def holds(self, path: Path) -> bool:
+        """Return whether a folder or a file is a result of this kind."""
+        if path.is_dir():
+            return any(all((path / name).exists() for name in marks) for marks in self.marks)
+        if self.companion and path.is_file():
+            return path.with_name(path.stem + self.companion).is_file()
+        return bool(self.array) and path.suffix == ".npz" and f"{self.array}.npy" in _members(path)
+
+
+def _members(archive: Path) -> list[str]:
+    """Return the names of what an archive holds; empty where it is none."""
+    try:
+        with ZipFile(archive) as content:
+            return content.namelist()
+    except (OSError, BadZipFile):
+        return []
 
 
 _SHOWN = "calib view {folder} shows it, calib export {folder} --into DIR writes the robot for other programs"
@@ -50,6 +73,7 @@ KINDS = (
         },
     ),
     ResultKind("export", "an exported robot", ((OFFSETS, "README.txt"), (PARAMETERS, "README.txt"))),
+    ResultKind("package", "a ROS 2 package", (("package.xml",),)),
     ResultKind(
         "identification",
         "the result of an identification",
@@ -62,9 +86,14 @@ KINDS = (
     ResultKind("comparison", "a comparison of calib diff", ((METRICS, "changes.csv"), (METRICS, "torque_changes.csv"))),
     ResultKind("drift", "a report of calib drift", (("trends.csv",),)),
     ResultKind("log", "a report of calib log", (("log.csv", METRICS),)),
+    ResultKind("study", "a study of calib study", (("rows.sqlite",), ("rows.parquet",))),
     ResultKind("robot", "a robot", (("robot.toml",),)),
-    ResultKind("fleet", "a report of calib fleet", ((METRICS, "report.html"),)),
+    # The second set of files: reports of versions that wrote no table of the arms.
+    ResultKind("fleet", "a report of calib fleet", (("fleet.csv", METRICS), (METRICS, "report.html"))),
+    ResultKind("selection", "a list of poses of calib select", companion="_prediction.json"),
+    ResultKind("recall", "an averaged period of calib recall", array="periods"),
 )
+BY_NAME = {kind.name: kind for kind in KINDS}
 
 # What each verb takes, in words. `robot` stands for every command that takes a robot.
 TAKES = {
@@ -77,6 +106,7 @@ TAKES = {
     "log": "folders of sessions",
     "program": "a list of poses, a program, or the folder of a motion",
     "recall": "the folder of calib excite",
+    "result": "the folder that a command wrote with --out, or that of a session",
     "session": "the folder of a session; calib new makes one",
     "robot": "a URDF, xacro, MJCF or TOML file, the folder of a fit, or a robot of the library",
     "view": "a folder with measured poses, a motion or torques",
@@ -84,14 +114,11 @@ TAKES = {
 
 
 def kind_of(path: str | Path) -> ResultKind | None:
-    """Return the kind of result in a folder; None for a folder of something else, and for what is no folder."""
-    folder = Path(path)
-    if not folder.is_dir():
-        return None
+    """Return the kind of the result in a folder or a file; None for what is no result."""
+    path = Path(path)
     for kind in KINDS:
-        for marks in kind.marks:
-            if all((folder / name).exists() for name in marks):
-                return kind
+        if kind.holds(path):
+            return kind
     return None
 
 

@@ -243,7 +243,8 @@ def finding_list() -> str:
     intro = (
         "What `calib` may say about data and results: on the console, on the certificate, in `metrics.json`. "
         "`calib explain CODE` prints one. A verdict is the worst level among the findings; `accept` in the options "
-        "file makes a finding a note. Values in braces are filled in; a part in `<…>` is left out if it has no value."
+        "file makes a finding a note. Words in capitals stand for values; a part in brackets is left out if it has "
+        "none."
     )
     parts = ["# Findings", intro]
     for line in Path(findings.__file__).with_suffix(".toml").read_text(encoding="utf-8").splitlines():
@@ -256,10 +257,10 @@ def finding_list() -> str:
 
 def _finding(name: str, one: findings.CatalogueEntry) -> str:
     rows = [
-        ("Says", cell(one.says)),
+        ("Says", cell(findings.in_words(one.says))),
         ("Level", cell(findings.levels(one))),
         ("Means", cell(one.means)),
-        ("Do", cell(one.advice)),
+        ("Do", cell(findings.in_words(one.advice))),
         ("Accept", code(f'accept = ["{one.accept}"]') if one.accept else ""),
     ]
     return f"(finding-{name})=\n### {name}\n\n" + table(("", ""), [row for row in rows if row[1]])

@@ -26,7 +26,7 @@ def exchanged_by_index(
 
     Args:
         jacobians: (N, rows, p) whitened Jacobians.
-        known: (p, p) information already measured.
+        known_information: (p, p), already measured.
         members: start.
         index: "O1" ... "O5", "cond".
         report: called with every improved set and its merit.
@@ -44,7 +44,9 @@ def exchanged_by_index(
         for position in range(len(chosen)):
             thinned = matrix - _gram(jacobians[chosen[position]][None])
             trials = _screened(jacobians, matrix, chosen, index, screen)
-            trial_merits = merits(thinned + jacobians[trials].transpose(0, 2, 1) @ jacobians[trials], index)
+            candidate_rows = jacobians[trials]
+            trial_information = thinned + candidate_rows.transpose(0, 2, 1) @ candidate_rows
+            trial_merits = merits(trial_information, index)
             if trial_merits.max() > best + 1e-9:
                 best = float(trial_merits.max())
                 chosen[position] = int(trials[trial_merits.argmax()])
@@ -65,20 +67,27 @@ def merits(matrices: np.ndarray, index: Index) -> np.ndarray:
     regular = values[:, -1] > 1e-14 * values[:, 0]
     out = np.full(len(matrices), -np.inf)
     s = np.sqrt(values[regular])
-    out[regular] = np.log(index_of_singular_values(s, index, 1)) * (-1.0 if index == "cond" else 1.0)
+    indices = index_of_singular_values(s, index, 1)
+    sign = -1.0 if index == "cond" else 1.0
+    out[regular] = np.log(indices) * sign
     return out
 
 
 def _screened(jacobians: np.ndarray, matrix: np.ndarray, chosen: list[int], index: Index, screen: int) -> np.ndarray:
     values, vectors = np.linalg.eigh(matrix)
-    s = np.sqrt(np.maximum(values[::-1], 1e-14 * values[-1]))
+    floor = 1e-14 * values[-1]
+    s = np.sqrt(np.maximum(values[::-1], floor))
     sign = -1.0 if index == "cond" else 1.0
-    flat = jacobians.reshape(-1, jacobians.shape[2]) @ vectors[:, ::-1]
+    rows = jacobians.reshape(-1, jacobians.shape[2])
+    flat = rows @ vectors[:, ::-1]
     squares = (flat**2).reshape(jacobians.shape).sum(1)
     trials = set[int]()
-    for scores in (squares @ (sign * log_slope(s, index) / (2 * s)), squares @ s**-4.0):
+    first_order_gains = squares @ (sign * log_slope(s, index) / (2 * s))
+    a_optimality_gains = squares @ s**-4.0
+    for scores in (first_order_gains, a_optimality_gains):
         scores[chosen] = -np.inf
-        trials |= set(np.argsort(-scores, kind="stable")[:screen].tolist())
+        ranked = np.argsort(-scores, kind="stable")
+        trials |= set(ranked[:screen].tolist())
     return np.array(sorted(trials - set(chosen)))
 
 

@@ -42,15 +42,22 @@ def draw_candidates(
     if low.ndim != 1 or low.shape != high.shape or not (low < high).all():
         raise BadInput(f"limits: expected two (n,) arrays with lower < upper, found {low} and {high}")
     require(count >= 1, f"count = {count}: ask for at least one candidate")
-    max_draws = max(200 * count, 100_000) if max_draws is None else max_draws
+    if max_draws is None:
+        max_draws = max(200 * count, 100_000)
+    else:
+        max_draws = max_draws
     block = 1 << max(int(block - 1).bit_length(), 0)  # Sobol points keep their balance in powers of two
     sequence = qmc.Sobol(len(low), scramble=True, rng=np.random.default_rng(seed))
-    blocks, count_found, drawn = list[np.ndarray](), 0, 0
+    blocks = list[np.ndarray]()
+    count_found = 0
+    drawn = 0
     while count_found < count and drawn < max_draws:
-        q = low + (high - low) * sequence.random(block)
+        fractions = sequence.random(block)
+        q = low + (high - low) * fractions
         drawn += block
         if feasible is not None:
-            q = q[np.asarray(feasible(q), dtype=bool)]
+            is_allowed = np.asarray(feasible(q), dtype=bool)
+            q = q[is_allowed]
         blocks.append(q)
         count_found += len(q)
     if count_found < count:

@@ -24,7 +24,8 @@ def height(tool: Tool, lowest: float, highest: float = np.inf, jacobian: ToolJac
     slope = None
     if jacobian is not None:
         slope = partial(_height_gradient, jacobian, limits)
-    return PoseConstraint("height", partial(_height, tool, limits), slope)
+    values = partial(_height, tool, limits)
+    return PoseConstraint("height", values, slope)
 
 
 def _finite_limits(lower: float, upper: float) -> tuple[tuple[float, float], ...]:
@@ -42,7 +43,8 @@ def axis_distance(tool: Tool, min_distance: float, jacobian: ToolJacobian | None
     slope = None
     if jacobian is not None:
         slope = partial(_axis_gradient, tool, jacobian)
-    return PoseConstraint("distance from the axis", partial(_axis, tool, min_distance), slope)
+    values = partial(_axis, tool, min_distance)
+    return PoseConstraint("distance from the axis", values, slope)
 
 
 def reach(
@@ -53,7 +55,8 @@ def reach(
     slope = None
     if jacobian is not None:
         slope = partial(_reach_gradient, tool, jacobian, point)
-    return PoseConstraint("reach", partial(_reach, tool, max_distance, point), slope)
+    values = partial(_reach, tool, max_distance, point)
+    return PoseConstraint("reach", values, slope)
 
 
 def distance(
@@ -68,7 +71,8 @@ def distance(
     slope = None
     if jacobian is not None:
         slope = partial(_distance_gradient, tool, jacobian, limits, point)
-    return PoseConstraint("range of the instrument", partial(_distance, tool, limits, point), slope)
+    values = partial(_distance, tool, limits, point)
+    return PoseConstraint("range of the instrument", values, slope)
 
 
 def orientation(
@@ -93,7 +97,8 @@ def orientation(
     slope = None
     if jacobian is not None:
         slope = partial(_orientation_gradient, tool, jacobian, stand)
-    return PoseConstraint("orientation", partial(_orientation, tool, stand, roll, pitch), slope)
+    values = partial(_orientation, tool, stand, roll, pitch)
+    return PoseConstraint("orientation", values, slope)
 
 
 def line_of_sight(
@@ -114,59 +119,84 @@ def line_of_sight(
     slope = None
     if jacobian is not None:
         slope = partial(_sight_gradient, tool, jacobian, station, facing)
-    return PoseConstraint("line of sight", partial(_sight, tool, station, facing, half_angle), slope)
+    values = partial(_sight, tool, station, facing, half_angle)
+    return PoseConstraint("line of sight", values, slope)
 
 
 def _height(tool, limits, q):
-    z = tool(q)[1][:, 2]
-    return np.stack([sign * (z - bound) for sign, bound in limits], axis=1)
+    _, position = tool(q)
+    z = position[:, 2]
+    excess = [sign * (z - bound) for sign, bound in limits]
+    return np.stack(excess, axis=1)
 
 
 def _height_gradient(jacobian, limits, q):
     row = jacobian(q)[:, 2]
-    return np.stack([sign * row for sign, _ in limits], axis=1)
+    rows = [sign * row for sign, _ in limits]
+    return np.stack(rows, axis=1)
 
 
 def _axis(tool, min_distance, q):
-    x = tool(q)[1]
-    return min_distance**2 - (x[:, :2] ** 2).sum(1, keepdims=True)
+    _, position = tool(q)
+    squared_distance = (position[:, :2] ** 2).sum(1, keepdims=True)
+    return min_distance**2 - squared_distance
 
 
 def _axis_gradient(tool, jacobian, q):
     _, position = tool(q)
-    return -2 * np.einsum("mi,min->mn", position[:, :2], jacobian(q)[:, :2])[:, None]
+    slope = jacobian(q)[:, :2]
+    rows = np.einsum("mi,min->mn", position[:, :2], slope)
+    return -2 * rows[:, None]
 
 
 def _reach(tool, max_distance, centre, q):
-    return ((tool(q)[1] - centre) ** 2).sum(1, keepdims=True) - max_distance**2
+    _, position = tool(q)
+    from_centre = position - centre
+    squared_distance = (from_centre**2).sum(1, keepdims=True)
+    return squared_distance - max_distance**2
 
 
 def _reach_gradient(tool, jacobian, centre, q):
     _, position = tool(q)
-    return 2 * np.einsum("mi,min->mn", position - centre, jacobian(q)[:, :3])[:, None]
+    slope = jacobian(q)[:, :3]
+    rows = np.einsum("mi,min->mn", position - centre, slope)
+    return 2 * rows[:, None]
 
 
 def _distance(tool, limits, centre, q):
-    length = np.linalg.norm(tool(q)[1] - centre, axis=1)
-    return np.stack([sign * (length - bound) for sign, bound in limits], axis=1)
+    _, position = tool(q)
+    length = np.linalg.norm(position - centre, axis=1)
+    excess = [sign * (length - bound) for sign, bound in limits]
+    return np.stack(excess, axis=1)
 
 
 def _distance_gradient(tool, jacobian, limits, centre, q):
-    from_centre = tool(q)[1] - centre
-    direction = from_centre / np.linalg.norm(from_centre, axis=1, keepdims=True)
-    row = np.einsum("mi,min->mn", direction, jacobian(q)[:, :3])
-    return np.stack([sign * row for sign, _ in limits], axis=1)
+    _, position = tool(q)
+    from_centre = position - centre
+    length = np.linalg.norm(from_centre, axis=1, keepdims=True)
+    direction = from_centre / length
+    slope = jacobian(q)[:, :3]
+    row = np.einsum("mi,min->mn", direction, slope)
+    rows = [sign * row for sign, _ in limits]
+    return np.stack(rows, axis=1)
 
 
 def _orientation(tool, camera, roll, pitch, q):
-    in_camera = camera.T @ tool(q)[0]
-    phi = np.arctan2(in_camera[:, 2, 1], in_camera[:, 2, 2])
-    theta = np.arcsin(np.clip(-in_camera[:, 2, 0], -1, 1))
-    return np.stack([roll[0] - phi, phi - roll[1], pitch[0] - theta, theta - pitch[1]], axis=1)
+    rotation, _ = tool(q)
+    in_camera = camera.T @ rotation
+    last_row = in_camera[:, 2]
+    phi = np.arctan2(last_row[:, 1], last_row[:, 2])
+    sine = np.clip(-last_row[:, 0], -1, 1)
+    theta = np.arcsin(sine)
+    excess = [roll[0] - phi, phi - roll[1], pitch[0] - theta, theta - pitch[1]]
+    return np.stack(excess, axis=1)
 
 
 def _orientation_gradient(tool, jacobian, camera, q):
-    x, y = (camera.T @ tool(q)[0])[:, :2, 0].T[:, :, None]  # cos θ cos ψ, cos θ sin ψ
+    # first column of the rotation: cos θ cos ψ, cos θ sin ψ
+    rotation, _ = tool(q)
+    in_camera = camera.T @ rotation
+    x, y = in_camera[:, :2, 0].T[:, :, None]
     turn = camera.T @ jacobian(q)[:, 3:]
     cosine = np.maximum(np.hypot(x, y), 1e-9)
     roll = (x * turn[:, 0] + y * turn[:, 1]) / cosine**2
@@ -177,8 +207,11 @@ def _orientation_gradient(tool, jacobian, camera, q):
 def _sight(tool, station, facing, half_angle, q):
     rotation, x = tool(q)
     to_station = station - x
-    u = to_station / np.linalg.norm(to_station, axis=1, keepdims=True)
-    return np.cos(half_angle) - ((rotation @ facing) * u).sum(1, keepdims=True)
+    length = np.linalg.norm(to_station, axis=1, keepdims=True)
+    u = to_station / length
+    face = rotation @ facing
+    cosine = (face * u).sum(1, keepdims=True)
+    return np.cos(half_angle) - cosine
 
 
 def _sight_gradient(tool, jacobian, station, facing, q):
@@ -188,8 +221,10 @@ def _sight_gradient(tool, jacobian, station, facing, q):
     length = np.linalg.norm(to_station, axis=1, keepdims=True)
     u = to_station / length
     # ∂(face·u)/∂x = −across; ∂/∂ω = face × u
-    across = (face - (face * u).sum(1, keepdims=True) * u) / length
+    cosine = (face * u).sum(1, keepdims=True)
+    across = (face - cosine * u) / length
     slope = jacobian(q)
     by_position = np.einsum("mi,min->mn", across, slope[:, :3])
-    by_rotation = np.einsum("mi,min->mn", np.cross(face, u), slope[:, 3:])
+    turning_axis = np.cross(face, u)
+    by_rotation = np.einsum("mi,min->mn", turning_axis, slope[:, 3:])
     return (by_position - by_rotation)[:, None]

@@ -79,12 +79,17 @@ def bound(
 
 def relaxed(candidates: Candidates, m: int, *, capped: bool = True, tolerance: float = 1e-3, rounds: int = 12) -> Bound:
     """Return the solved relaxation over prepared candidates; see `bound`."""
-    z, known_information = candidates.z, candidates.known
+    z = candidates.z
+    known_information = candidates.known
     count, _, p = z.shape
-    cap = 1.0 if capped else float(m)
+    if capped:
+        cap = 1.0
+    else:
+        cap = float(m)
     x, scores = _warm(z, known_information, m, cap)
     best = _certify(z, known_information, x, m, capped)
-    active = _largest(scores, min(count, max(2 * m, 3 * p) + p))
+    active_count = min(count, max(2 * m, 3 * p) + p)
+    active = _largest(scores, active_count)
     iterations = 0
     for _ in range(rounds):
         if best.log_upper - best.logdet <= p * np.log1p(tolerance):
@@ -96,22 +101,26 @@ def relaxed(candidates: Candidates, m: int, *, capped: bool = True, tolerance: f
         certified = _certify(z, known_information, x, m, capped)
         best = _tighter(best, certified)
         active = _priced(certified.scores, x, active, price, 2 * p)
-    gap = float(np.expm1((best.log_upper - best.logdet) / p))
+    excess = (best.log_upper - best.logdet) / p
+    gap = float(np.expm1(excess))
     log_upper = best.log_upper + candidates.shift
     logdet = best.logdet + candidates.shift
-    return Bound(best.x, logdet, float(np.exp(log_upper / p)), log_upper, gap, iterations, capped, best.scores)
+    upper = float(np.exp(log_upper / p))
+    return Bound(best.x, logdet, upper, log_upper, gap, iterations, capped, best.scores)
 
 
 def certificate(candidates: Candidates, x: np.ndarray, m: int, capped: bool = True) -> float:
     """Return the upper bound on log det M that any weights x (N,) certify (+inf if M is singular)."""
-    return _certify(candidates.z, candidates.known, x, m, capped).log_upper + candidates.shift
+    certified = _certify(candidates.z, candidates.known, x, m, capped)
+    return certified.log_upper + candidates.shift
 
 
 def information_of(z: np.ndarray, known_information: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Return M = M_known + Σ x_i z_iᵀz_i (p, p) from z (N, rows, p) and weights x (N,)."""
     chosen = np.flatnonzero(x)
     rows = z[chosen].reshape(-1, z.shape[2])
-    return known_information + rows.T @ (rows * np.repeat(x[chosen], z.shape[1])[:, None])
+    row_weights = np.repeat(x[chosen], z.shape[1])
+    return known_information + rows.T @ (rows * row_weights[:, None])
 
 
 def scores_of(z: np.ndarray, matrix: np.ndarray) -> np.ndarray:
@@ -124,21 +133,28 @@ def scores_of(z: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 def _certify(z: np.ndarray, known_information: np.ndarray, x: np.ndarray, m: int, capped: bool) -> _Certified:
     matrix = information_of(z, known_information, x)
-    logdet, p = float(log_det(matrix)), len(matrix)
+    logdet = float(log_det(matrix))
+    p = len(matrix)
     if not np.isfinite(logdet) or np.linalg.eigvalsh(matrix)[0] <= 1e-12 * np.trace(matrix):
-        return _Certified(x, np.einsum("nrp,nrp->n", z, z), -np.inf, np.inf)
+        scores = np.einsum("nrp,nrp->n", z, z)
+        return _Certified(x, scores, -np.inf, np.inf)
     scores = scores_of(z, matrix)
     top = m * scores.max()
     if capped:
         top = np.partition(scores, len(scores) - m)[-m:].sum()
-    total = float(np.trace(np.linalg.solve(matrix, known_information)) + top)
-    return _Certified(x, scores, logdet, logdet + p * float(np.log(total / p)))
+    known_trace = np.trace(np.linalg.solve(matrix, known_information))
+    total = float(known_trace + top)
+    log_upper = logdet + p * float(np.log(total / p))
+    return _Certified(x, scores, logdet, log_upper)
 
 
 def _tighter(first: _Certified, second: _Certified) -> _Certified:
     """Return the better weights of two, and the tighter bound of two."""
     upper = min(first.log_upper, second.log_upper)
-    better = second if second.logdet >= first.logdet else first
+    if second.logdet >= first.logdet:
+        better = second
+    else:
+        better = first
     return _Certified(better.x, better.scores, better.logdet, upper)
 
 
@@ -147,33 +163,42 @@ def _warm(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return initial weights by a few multiplicative steps, and their scores."""
     x = np.full(len(z), m / len(z))
-    scores = scores_of(z, information_of(z, known_information, x))
+    matrix = information_of(z, known_information, x)
+    scores = scores_of(z, matrix)
     if len(z) * cap <= m:
         # with no choice left x = 1 is the answer
         return x, scores
     for _ in range(steps):
         x = x * scores**1.5
         for _ in range(3):
-            x = np.minimum(x * (m / x.sum()), cap)
-        scores = scores_of(z, information_of(z, known_information, x))
+            scale = m / x.sum()
+            x = np.minimum(x * scale, cap)
+        matrix = information_of(z, known_information, x)
+        scores = scores_of(z, matrix)
     return x, scores
 
 
 def _largest(values: np.ndarray, count: int) -> np.ndarray:
     """Return the sorted indices of the `count` largest values."""
-    return np.sort(np.argpartition(values, len(values) - count)[-count:])
+    order = np.argpartition(values, len(values) - count)
+    return np.sort(order[-count:])
 
 
 def _priced(scores: np.ndarray, x: np.ndarray, active: np.ndarray, price: float, max_count: int) -> np.ndarray:
     """Return the next active set: candidates with weight or near the price, and the worst violators."""
-    keep = active[(x[active] > 1e-4) | (scores[active] > 0.9 * price)]
+    has_weight = x[active] > 1e-4
+    near_price = scores[active] > 0.9 * price
+    keep = active[has_weight | near_price]
     if len(keep) < x.sum() + 2:
         # all at the cap: leave the interior point room to move
         keep = active
     candidates = scores.copy()
     candidates[keep] = -np.inf
-    count = min(max_count, int((candidates > price).sum()))
-    return np.sort(np.concatenate([keep, _largest(candidates, count)])) if count else keep
+    violators = int((candidates > price).sum())
+    count = min(max_count, violators)
+    if not count:
+        return keep
+    return np.sort(np.concatenate([keep, _largest(candidates, count)]))
 
 
 def _interior(
@@ -192,20 +217,28 @@ def _interior(
         (Q + u/x + v/(cap−x)) dx + λ = d + τ/x − τ/(cap−x),  Σ dx = m − Σ x,   Q_ij = ‖z_i M⁻¹ z_jᵀ‖² .
     """
     count, _, p = z.shape
-    x = 0.9 * np.clip(x * (m / max(x.sum(), 1e-12)), 0.0, cap) + 0.1 * (m / count)
+    mean = m / count
+    scale = m / max(x.sum(), 1e-12)
+    scaled = np.clip(x * scale, 0.0, cap)
+    x = 0.9 * scaled + 0.1 * mean
     x = np.minimum(x, 0.95 * cap + 0.05 * m / count)
     tau = 0.1 * p / count
     u = tau / x
     v = tau / (cap - x)
     price = 0.0
     for step in range(1, max_steps + 1):
-        scores, curvature = _newton_terms(z, information_of(z, known_information, x))
+        matrix = information_of(z, known_information, x)
+        scores, curvature = _newton_terms(z, matrix)
         slack = cap - x
         hessian = curvature + np.diag(u / x + v / slack)
         right = scores + tau / x - tau / slack
-        solved = np.linalg.solve(hessian, np.stack([right, np.ones(count)], axis=1))
-        price = float((solved[:, 0].sum() - (m - x.sum())) / solved[:, 1].sum())
-        dx = solved[:, 0] - price * solved[:, 1]
+        right_sides = np.stack([right, np.ones(count)], axis=1)
+        solution = np.linalg.solve(hessian, right_sides)
+        by_scores = solution[:, 0]
+        by_sum = solution[:, 1]
+        missing = m - x.sum()
+        price = float((by_scores.sum() - missing) / by_sum.sum())
+        dx = by_scores - price * by_sum
         du = tau / x - u - u / x * dx
         dv = tau / slack - v + v / slack * dx
         primal = min(1.0, 0.99 * _longest(x, dx), 0.99 * _longest(slack, -dx))
@@ -214,9 +247,13 @@ def _interior(
         u = u + dual * du
         v = v + dual * dv
         complementarity = float(x @ u + (cap - x) @ v)
-        if complementarity < 0.3 * p * tolerance and abs(x.sum() - m) < 1e-9 * m and primal > 0.5:
+        sum_error = abs(x.sum() - m)
+        if complementarity < 0.3 * p * tolerance and sum_error < 1e-9 * m and primal > 0.5:
             return x, price, step
-        factor = 0.1 if min(primal, dual) > 0.5 else 0.5
+        if min(primal, dual) > 0.5:
+            factor = 0.1
+        else:
+            factor = 0.5
         tau = factor * complementarity / (2 * count)
     return x * (m / x.sum()), price, max_steps
 
@@ -225,12 +262,15 @@ def _newton_terms(z: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.nda
     """Return gradient d (K,) and matrix Q (K, K) of the Newton step for a few candidates."""
     count, rows, p = z.shape
     root = np.linalg.inv(np.linalg.cholesky(matrix))
-    spread = (z.reshape(-1, p) @ root.T).reshape(count, rows, p)
-    inner = np.einsum("nrp,nrq->npq", spread, spread, optimize=True).reshape(count, -1)
+    rows_spread = z.reshape(-1, p) @ root.T
+    spread = rows_spread.reshape(count, rows, p)
+    inner = np.einsum("nrp,nrq->npq", spread, spread, optimize=True)
+    squares = inner.reshape(count, -1).reshape(count, p, p)
     i, j = np.triu_indices(p)
     weights = np.where(i == j, 1.0, np.sqrt(2.0))
-    packed = inner.reshape(count, p, p)[:, i, j] * weights
-    return np.einsum("nrp,nrp->n", spread, spread), packed @ packed.T
+    packed = squares[:, i, j] * weights
+    scores = np.einsum("nrp,nrp->n", spread, spread)
+    return scores, packed @ packed.T
 
 
 def _longest(value: np.ndarray, step: np.ndarray) -> float:
@@ -238,4 +278,5 @@ def _longest(value: np.ndarray, step: np.ndarray) -> float:
     falling = step < 0
     if not falling.any():
         return np.inf
-    return float((-value[falling] / step[falling]).min())
+    lengths = -value[falling] / step[falling]
+    return float(lengths.min())

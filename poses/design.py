@@ -48,13 +48,18 @@ class Design:
 def design_of(pool: Pool, members: tuple[int, ...]) -> Design:
     """Return the design of given members, recomputed (this removes rounding errors of many updates)."""
     p = pool.z.shape[2]
+    count = len(pool.z)
     rows = pool.z[list(members)].reshape(-1, p)
-    matrix = pool.known + RIDGE * np.eye(p) + rows.T @ rows
+    ridge = RIDGE * np.eye(p)
+    matrix = pool.known + ridge + rows.T @ rows
     root = np.linalg.inv(np.linalg.cholesky(matrix))
-    spread = (pool.z.reshape(-1, p) @ root.T).reshape(len(pool.z), -1)
-    is_member = np.zeros(len(pool.z), dtype=bool)
+    rows_spread = pool.z.reshape(-1, p) @ root.T
+    spread = rows_spread.reshape(count, -1)
+    is_member = np.zeros(count, dtype=bool)
     is_member[list(members)] = True
-    return Design(members, root.T @ root, np.einsum("ij,ij->i", spread, spread), float(log_det(matrix)), is_member)
+    scores = np.einsum("ij,ij->i", spread, spread)
+    logdet = float(log_det(matrix))
+    return Design(members, root.T @ root, scores, logdet, is_member)
 
 
 def with_added(pool: Pool, design: Design, i: int) -> Design:
@@ -82,16 +87,19 @@ def best_addition(pool: Pool, design: Design, above: float = -np.inf, first: int
     """
     rows = pool.z.shape[1]
     scores = np.where(design.taken, -np.inf, design.scores)
-    best, gain = -1, above
+    best = -1
+    gain = above
     min_score = rows * np.expm1(max(above, 0.0) / rows)
     while True:
-        possible = np.flatnonzero(scores > min_score)
-        if not len(possible):
+        candidates = np.flatnonzero(scores > min_score)
+        if not len(candidates):
             return best, gain
-        batch = possible[np.argsort(-scores[possible], kind="stable")[:first]]
+        order = np.argsort(-scores[candidates], kind="stable")
+        batch = candidates[order[:first]]
         gains = gains_of(pool, design, batch, 1.0)
         if gains.max() > gain:
-            best, gain = int(batch[gains.argmax()]), float(gains.max())
+            best = int(batch[gains.argmax()])
+            gain = float(gains.max())
         scores[batch] = -np.inf
         min_score = rows * np.expm1(max(gain, 0.0) / rows)
         first *= 4
@@ -107,8 +115,10 @@ def best_removal(pool: Pool, design: Design) -> tuple[int, float]:
 def gains_of(pool: Pool, design: Design, candidates: np.ndarray, sign: float) -> np.ndarray:
     """Return log det(I ± z_i C z_iᵀ) of some candidates (K,)."""
     z = pool.z[candidates]
-    blocks = (z @ design.inverse) @ z.transpose(0, 2, 1)
-    return log_det(np.eye(z.shape[1]) + sign * blocks)
+    transposed = z.transpose(0, 2, 1)
+    blocks = (z @ design.inverse) @ transposed
+    identity = np.eye(z.shape[1])
+    return log_det(identity + sign * blocks)
 
 
 def _changed(pool: Pool, design: Design, i: int, sign: float) -> Design:
@@ -118,10 +128,17 @@ def _changed(pool: Pool, design: Design, i: int, sign: float) -> Design:
     block = np.eye(rows) + sign * (zc @ z.T)
     root = np.linalg.cholesky((block + block.T) / 2)
     half = np.linalg.solve(root, zc)
-    spread = (pool.z.reshape(-1, p) @ half.T).reshape(count, -1)
+    rows_spread = pool.z.reshape(-1, p) @ half.T
+    spread = rows_spread.reshape(count, -1)
     is_member = design.taken.copy()
     is_member[i] = sign > 0
-    members = (*design.members, i) if sign > 0 else tuple(k for k in design.members if k != i)
-    scores = np.maximum(design.scores - sign * np.einsum("ij,ij->i", spread, spread), 0.0)
-    logdet = design.logdet + 2.0 * float(np.log(np.diag(root)).sum())
-    return Design(members, design.inverse - sign * (half.T @ half), scores, logdet, is_member)
+    if sign > 0:
+        members = (*design.members, i)
+    else:
+        members = tuple(member for member in design.members if member != i)
+    change = np.einsum("ij,ij->i", spread, spread)
+    scores = np.maximum(design.scores - sign * change, 0.0)
+    half_logdet = float(np.log(np.diag(root)).sum())
+    logdet = design.logdet + 2.0 * half_logdet
+    inverse = design.inverse - sign * (half.T @ half)
+    return Design(members, inverse, scores, logdet, is_member)

@@ -18,7 +18,8 @@ def greedy(pool: Pool, m: int) -> Design:
     """Add the candidate that raises det M most, m times, starting from the known information."""
     design = design_of(pool, ())
     for _ in range(m):
-        design = with_added(pool, design, best_addition(pool, design)[0])
+        candidate, _ = best_addition(pool, design)
+        design = with_added(pool, design, candidate)
     return design_of(pool, design.members)
 
 
@@ -66,19 +67,23 @@ def detmax(pool: Pool, design: Design, report: Report | None = None, *, longest:
         failures: excursions in a row without gain.
     """
     failed: set[frozenset[int]] = set()
-    fruitless, over = 0, {True: False, False: False}
+    fruitless = 0
+    over = {True: False, False: False}
     upwards = True
     while fruitless < failures and not all(over.values()):
         back, passed = _excursion(pool, design, upwards, longest, failed)
         if back is not None and back.logdet > design.logdet + TOLERANCE:
             design = exchanged(pool, design_of(pool, back.members), sweeps=1)
-            failed, fruitless, over = set(), 0, {True: False, False: False}
+            failed = set()
+            fruitless = 0
+            over = {True: False, False: False}
             if report:
                 report(design)
             continue
         failed |= passed
         over[upwards] = back is None
-        fruitless, upwards = fruitless + 1, not upwards
+        fruitless = fruitless + 1
+        upwards = not upwards
     return design
 
 
@@ -110,16 +115,22 @@ def kicked(
     """
     deadline = time.process_time() + seconds
     generator = np.random.default_rng(seed)
-    m, count = len(design.members), len(pool.z)
-    share = np.full(count, 1.0) if weights is None else weights + 1e-3 * m / count
+    m = len(design.members)
+    count = len(pool.z)
+    if weights is None:
+        share = np.full(count, 1.0)
+    else:
+        share = weights + 1e-3 * m / count
     size = min(size, m, count - m)
     for _ in range(rounds if size > 0 else 0):
         if time.process_time() > deadline:
             break
         leaving = set(generator.choice(design.members, size, replace=False).tolist())
         free = np.flatnonzero(~design.taken)
-        coming = generator.choice(free, size, replace=False, p=share[free] / share[free].sum())
-        members = [k for k in design.members if k not in leaving] + coming.tolist()
+        probability = share[free] / share[free].sum()
+        coming = generator.choice(free, size, replace=False, p=probability)
+        remaining = [k for k in design.members if k not in leaving]
+        members = remaining + coming.tolist()
         trial = exchanged(pool, design_of(pool, tuple(members)))
         if trial.logdet > design.logdet + TOLERANCE:
             design = trial
@@ -132,7 +143,10 @@ def _excursion(
     pool: Pool, start: Design, upwards: bool, longest: int, failed: set[frozenset[int]]
 ) -> tuple[Design | None, set[frozenset[int]]]:
     """Return the design at the end of one excursion (None if it went too far), and the designs passed."""
-    m, passed, design, larger = len(start.members), set[frozenset[int]](), start, upwards
+    m = len(start.members)
+    passed = set[frozenset[int]]()
+    design = start
+    larger = upwards
     while True:
         size = len(design.members) + (1 if larger else -1)
         if abs(size - m) > longest or size < 1 or size > len(pool.z):
@@ -148,5 +162,7 @@ def _excursion(
 
 def _step(pool: Pool, design: Design, add: bool) -> Design:
     if add:
-        return with_added(pool, design, best_addition(pool, design)[0])
-    return with_removed(pool, design, best_removal(pool, design)[0])
+        candidate, _ = best_addition(pool, design)
+        return with_added(pool, design, candidate)
+    member, _ = best_removal(pool, design)
+    return with_removed(pool, design, member)

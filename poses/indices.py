@@ -43,7 +43,8 @@ def observability(W: ArrayLike, index: Index = "O1", m: int | None = None) -> fl
     stacked, poses = _stacked(W, index, m)
     if len(stacked) < stacked.shape[1]:
         return np.inf if index == "cond" else 0.0
-    return float(index_of_singular_values(np.linalg.svd(stacked, compute_uv=False), index, poses))
+    singular_values = np.linalg.svd(stacked, compute_uv=False)
+    return float(index_of_singular_values(singular_values, index, poses))
 
 
 def gradient(W: ArrayLike, index: Index = "O1", m: int | None = None) -> tuple[float, np.ndarray]:
@@ -63,7 +64,8 @@ def gradient(W: ArrayLike, index: Index = "O1", m: int | None = None) -> tuple[f
     stacked, poses = _stacked(W, index, m)
     u, s, vt = np.linalg.svd(stacked, full_matrices=False)
     value = float(index_of_singular_values(s, index, poses))
-    return value, ((u * (value * log_slope(s, index))) @ vt).reshape(np.shape(W))
+    slope = (u * (value * log_slope(s, index))) @ vt
+    return value, slope.reshape(np.shape(W))
 
 
 def merit(W: np.ndarray, index: Index, sharpness: float = np.inf) -> tuple[float, np.ndarray]:
@@ -87,11 +89,13 @@ def merit(W: np.ndarray, index: Index, sharpness: float = np.inf) -> tuple[float
     if index in ("O1", "O5") or not np.isfinite(sharpness):
         sign = -1.0 if index == "cond" else 1.0
         value = sign * float(np.log(index_of_singular_values(s, index, 1)))
-        return value, (u * (sign * log_slope(s, index))) @ vt
+        slope = (u * (sign * log_slope(s, index))) @ vt
+        return value, slope
     high, by_high = _soft_maximum(np.log(s), sharpness)
     low, by_low = _soft_maximum(-np.log(s), sharpness)
     below, above = _POWERS[index]
-    return -below * low - above * high, (u * ((below * by_low - above * by_high) / s)) @ vt
+    slope = (below * by_low - above * by_high) / s
+    return -below * low - above * high, (u * slope) @ vt
 
 
 def index_of_singular_values(s: np.ndarray, index: Index, m: int) -> np.ndarray:
@@ -107,7 +111,8 @@ def index_of_singular_values(s: np.ndarray, index: Index, m: int) -> np.ndarray:
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         if index == "O1":
-            return np.exp(np.log(s).mean(-1)) / np.sqrt(m)
+            mean_log = np.log(s).mean(-1)
+            return np.exp(mean_log) / np.sqrt(m)
         if index == "O2":
             return s[..., -1] / s[..., 0]
         if index == "O3":
@@ -118,7 +123,8 @@ def index_of_singular_values(s: np.ndarray, index: Index, m: int) -> np.ndarray:
             return 1.0 / (1.0 / s).sum(-1)
         if index == "cond":
             return s[..., 0] / s[..., -1]
-    raise BadInput(f"index '{index}' is not known; take one of {', '.join(get_args(Index))}")
+    names = ", ".join(get_args(Index))
+    raise BadInput(f"index '{index}' is not known; take one of {names}")
 
 
 def has_kinks(index: Index) -> bool:
@@ -151,12 +157,16 @@ def _soft_maximum(values: np.ndarray, sharpness: float) -> tuple[float, np.ndarr
 def _stacked(W: ArrayLike, index: Index, m: int | None) -> tuple[np.ndarray, int]:
     """Return W as (all rows, p) and the number of poses."""
     if index not in get_args(Index):
-        raise BadInput(f"index '{index}' is not known; take one of {', '.join(get_args(Index))}")
+        names = ", ".join(get_args(Index))
+        raise BadInput(f"index '{index}' is not known; take one of {names}")
     array = np.asarray(W, dtype=float)
     require(array.ndim in (2, 3) and array.size, f"W: expected (m, rows, p) or (m rows, p), found {array.shape}")
     if not np.isfinite(array).all():
         raise BadInput("W contains values that are not finite; check for poses outside the model's domain")
     if array.ndim == 2 and m is None and index == "O1":
         raise BadInput("O1 of a stacked W needs the number of poses: give m, or W as (m, rows, p)")
-    poses = m if m is not None else len(array)
+    if m is not None:
+        poses = m
+    else:
+        poses = len(array)
     return array.reshape(-1, array.shape[-1]), poses

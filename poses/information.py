@@ -43,8 +43,9 @@ def checked(jacobians: ArrayLike, name: str = "jacobians") -> np.ndarray:
     finite = np.isfinite(array).all(axis=(1, 2))
     if not finite.all():
         first = int(np.argmin(finite))
+        bad_count = int((~finite).sum())
         raise BadInput(
-            f"{name}: {int((~finite).sum())} of {len(array)} poses have values that are not finite, the first is pose "
+            f"{name}: {bad_count} of {len(array)} poses have values that are not finite, the first is pose "
             f"{first}; check the model there, or exclude such poses by the predicate"
         )
     return array
@@ -65,26 +66,30 @@ def prepared(jacobians: ArrayLike, m: int, existing: ArrayLike | None = None) ->
     """
     array = checked(jacobians)
     count, rows, p = array.shape
-    before = np.zeros((0, rows, p)) if existing is None else checked(existing, "existing")
+    before = np.zeros((0, rows, p))
+    if existing is not None:
+        before = checked(existing, "existing")
     if before.shape[2] != p:
         raise BadInput(f"existing: {before.shape[2]} parameters, the candidates have {p}")
-    _check_counts(count, rows, p, m, before.shape[0] * before.shape[1])
-    stacked, measured = array.reshape(-1, p), before.reshape(-1, p)
+    measured_rows = before.shape[0] * before.shape[1]
+    _check_counts(count, rows, p, m, measured_rows)
+    stacked = array.reshape(-1, p)
+    measured = before.reshape(-1, p)
     gram = (stacked.T @ stacked) / count
     past = measured.T @ measured
-    scale = np.sqrt(np.diag(gram) + np.diag(past) / count)
+    past_diagonal = np.diag(past) / count
+    scale = np.sqrt(np.diag(gram) + past_diagonal)
     _check_columns(scale)
     mean = (gram + past / count) / np.outer(scale, scale)
     _check_rank(mean)
-    transform = solve_triangular(np.linalg.cholesky(mean).T, np.eye(p)) / scale[:, None]
+    root = np.linalg.cholesky(mean).T
+    inverse_root = solve_triangular(root, np.eye(p))
+    transform = inverse_root / scale[:, None]
     known_information = transform.T @ past @ transform
     z = (stacked @ transform).reshape(array.shape)
-    return Candidates(
-        z,
-        (known_information + known_information.T) / 2,
-        transform,
-        -2.0 * float(np.log(np.abs(np.diag(transform))).sum()),
-    )
+    symmetric = (known_information + known_information.T) / 2
+    shift = -2.0 * float(np.log(np.abs(np.diag(transform))).sum())
+    return Candidates(z, symmetric, transform, shift)
 
 
 def log_det(matrices: np.ndarray) -> np.ndarray:
@@ -100,9 +105,14 @@ def _check_counts(count: int, rows: int, p: int, m: int, measured: int) -> None:
             f"{count} candidates for {m} poses: draw more candidates or ask for fewer poses", count, m
         )
     if m * rows + measured < p:
+        before = ""
+        if measured:
+            before = f" and {measured} rows measured before"
+        equations = m * rows + measured
+        needed = -(-(p - measured) // rows)
         raise NotIdentifiable(
-            f"{m} poses of {rows} rows{f' and {measured} rows measured before' if measured else ''} give "
-            f"{m * rows + measured} equations for {p} parameters: at least {-(-(p - measured) // rows)} poses needed"
+            f"{m} poses of {rows} rows{before} give {equations} equations for {p} parameters: at least {needed} poses "
+            "needed"
         )
 
 
@@ -117,7 +127,8 @@ def _check_columns(scale: np.ndarray) -> None:
 
 
 def _check_rank(mean: np.ndarray) -> None:
-    s = np.sqrt(np.maximum(np.linalg.eigvalsh(mean)[::-1], 0.0))
+    values = np.linalg.eigvalsh(mean)[::-1]
+    s = np.sqrt(np.maximum(values, 0.0))
     rank = int((s > RANK_TOLERANCE * s[0]).sum())
     if rank < len(s):
         raise NotIdentifiable(

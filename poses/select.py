@@ -176,11 +176,14 @@ def select_poses(
     began = time.perf_counter()
     method, index, seed = settings.method, settings.index, settings.seed
     if method not in get_args(Method):
-        raise BadInput(f"method '{method}' is not known; take one of {', '.join(get_args(Method))}")
+        names = ", ".join(get_args(Method))
+        raise BadInput(f"method '{method}' is not known; take one of {names}")
     if method != "detmax" and space is None:
         raise BadInput(f"method '{method}' moves joint values continuously: give space, with limits and a Jacobian")
     array, joints = _candidates(jacobians, q, space, settings.count, seed)
-    before = None if existing is None else checked(existing, "existing")
+    before = None
+    if existing is not None:
+        before = checked(existing, "existing")
     report = progress or (lambda done, total, message: None)
     report(0, 1, "convex bound")
     candidates = prepared(array, m, before)
@@ -215,16 +218,27 @@ def random_baseline(
     """
     generator = np.random.default_rng(seed)
     count, _, p = jacobians.shape
-    known_information = np.zeros((p, p)) if existing is None else existing.reshape(-1, p).T @ existing.reshape(-1, p)
-    best, best_set = -np.inf, np.arange(m)
+    known_information = np.zeros((p, p))
+    if existing is not None:
+        measured_rows = existing.reshape(-1, p)
+        known_information = measured_rows.T @ measured_rows
+    best = -np.inf
+    best_set = np.arange(m)
     chunk = max(1, 2_000_000 // (m * jacobians.shape[1] * p))
     for first in range(0, sets, chunk):
-        drawn = np.array([generator.choice(count, m, replace=False) for _ in range(min(chunk, sets - first))])
+        sets_of_chunk = min(chunk, sets - first)
+        subsets = [generator.choice(count, m, replace=False) for _ in range(sets_of_chunk)]
+        drawn = np.array(subsets)
         rows = jacobians[drawn].reshape(len(drawn), -1, p)
-        matrices = known_information + rows.transpose(0, 2, 1) @ rows
-        values = log_det(matrices) if index == "O1" else merits(matrices, index)
+        information = rows.transpose(0, 2, 1) @ rows
+        matrices = known_information + information
+        if index == "O1":
+            values = log_det(matrices)
+        else:
+            values = merits(matrices, index)
         if values.max() > best:
-            best, best_set = float(values.max()), drawn[values.argmax()]
+            best = float(values.max())
+            best_set = drawn[values.argmax()]
     return _value(jacobians[best_set], existing, index)
 
 
@@ -246,25 +260,34 @@ def _candidates(
 
 def _exchange(task: _Request) -> _Chosen:
     """Choose poses among the candidates; after Ctrl-C return the best so far."""
-    candidates, m, p = task.candidates, task.m, task.jacobians.shape[2]
+    candidates = task.candidates
+    m = task.m
+    p = task.jacobians.shape[2]
     all_candidates = Pool(candidates.z, candidates.known)
     # Candidates of small score at the relaxed optimum are hardly ever chosen: search the promising ones (1000 at least,
     # our choice), and polish among all at the end.
-    short = np.sort(np.argsort(-task.bound.scores, kind="stable")[: max(1000, 15 * m)])
-    pool, weights = Pool(candidates.z[short], candidates.known), task.bound.weights[short]
+    short_count = max(1000, 15 * m)
+    order = np.argsort(-task.bound.scores, kind="stable")
+    short = np.sort(order[:short_count])
+    pool = Pool(candidates.z[short], candidates.known)
+    weights = task.bound.weights[short]
     best: list[tuple[tuple[int, ...], float]] = []
 
     def keep(design: Design, where: np.ndarray = short) -> None:
         if not best or design.logdet > best[-1][1]:
-            best.append((tuple(int(where[i]) for i in design.members), design.logdet))
+            members = tuple(int(where[i]) for i in design.members)
+            best.append((members, design.logdet))
 
     def stage(number: int, message: str) -> None:
         task.progress(number, 5, message)
 
-    interrupted, began = False, time.process_time()
+    interrupted = False
+    began = time.process_time()
     try:
         stage(1, "exchange from the rounded relaxation")
-        rounded = design_of(pool, tuple(int(i) for i in np.argsort(-weights, kind="stable")[:m]))
+        order = np.argsort(-weights, kind="stable")[:m]
+        members = tuple(int(i) for i in order)
+        rounded = design_of(pool, members)
         keep(rounded)
         designs = [exchanged(pool, rounded, keep)]
         stage(2, "greedy start and exchange")
@@ -272,22 +295,21 @@ def _exchange(task: _Request) -> _Chosen:
         stage(3, "DETMAX excursions and kicks")
         design = detmax(pool, max(designs, key=lambda d: d.logdet), keep)
         # Kicks are skipped where the certificate leaves less than half a percent to win.
-        remaining = (task.bound.log_upper - candidates.shift - design.logdet) / p
-        design = kicked(
-            pool,
-            design,
-            task.settings.kicks if remaining > 0.005 else 0,
-            task.seed,
-            keep,
-            weights=weights,
-            seconds=task.settings.seconds - (time.process_time() - began),
-        )
+        log_ratio = task.bound.log_upper - candidates.shift - design.logdet
+        remaining = log_ratio / p
+        kicks = 0
+        if remaining > 0.005:
+            kicks = task.settings.kicks
+        elapsed = time.process_time() - began
+        seconds = task.settings.seconds - elapsed
+        design = kicked(pool, design, kicks, task.seed, keep, weights=weights, seconds=seconds)
         keep(design)
         stage(4, "exchange among all candidates")
-        polished = exchanged(
-            all_candidates, design_of(all_candidates, best[-1][0]), lambda d: keep(d, np.arange(len(candidates.z)))
-        )
-        keep(polished, np.arange(len(candidates.z)))
+        all_indices = np.arange(len(candidates.z))
+        members, _ = best[-1]
+        start = design_of(all_candidates, members)
+        polished = exchanged(all_candidates, start, lambda design: keep(design, all_indices))
+        keep(polished, all_indices)
     except KeyboardInterrupt:
         if not best:
             raise
@@ -303,18 +325,25 @@ def _exchange(task: _Request) -> _Chosen:
 def _by_index(task: _Request, members: tuple[int, ...]) -> _Chosen:
     """Improve the D-optimal set by exchanges for another index."""
     p = task.jacobians.shape[2]
-    past = np.zeros((0, p)) if task.before is None else task.before.reshape(-1, p)
+    past = np.zeros((0, p))
+    if task.before is not None:
+        past = task.before.reshape(-1, p)
     known_information = past.T @ past
-    rows = np.concatenate([past, task.jacobians[list(members)].reshape(-1, p)])
-    best = [(members, merit(rows, task.index)[0])]
+    chosen_rows = task.jacobians[list(members)].reshape(-1, p)
+    rows = np.concatenate([past, chosen_rows])
+    value, _ = merit(rows, task.index)
+    best = [(members, value)]
+
+    def keep(improved_members: tuple[int, ...], improved_value: float) -> None:
+        best.append((improved_members, improved_value))
+
     interrupted = False
     try:
-        exchanged_by_index(
-            task.jacobians, known_information, members, task.index, lambda found, value: best.append((found, value))
-        )
+        exchanged_by_index(task.jacobians, known_information, members, task.index, keep)
     except KeyboardInterrupt:
         interrupted = True
-    return _Chosen(best[-1][0], None, tuple(value for _, value in best), len(best), interrupted)
+    rising = tuple(value for _, value in best)
+    return _Chosen(best[-1][0], None, rising, len(best), interrupted)
 
 
 def _polished(task: _Request) -> _Chosen:
@@ -325,11 +354,12 @@ def _polished(task: _Request) -> _Chosen:
         return chosen
     space, joints = _movable(task)
     start = joints[sorted(chosen.members or ())]
-    remaining = task.settings.seconds - (time.process_time() - began)
+    elapsed = time.process_time() - began
+    remaining = task.settings.seconds - elapsed
     task.progress(0, 1, "local search")
-    return _of(
-        improved(space, start, task.index, task.before, evaluations=task.settings.evaluations, seconds=remaining)
-    )
+    effort = task.settings
+    run = improved(space, start, task.index, task.before, evaluations=effort.evaluations, seconds=remaining)
+    return _of(run)
 
 
 def _multistart(task: _Request, starts: int) -> _Chosen:
@@ -339,28 +369,27 @@ def _multistart(task: _Request, starts: int) -> _Chosen:
     def report(number: int, _: Improved) -> None:
         task.progress(number + 1, starts, "local searches")
 
-    return _of(
-        multistart_search(
-            space,
-            random_starts(joints, task.m, starts, task.seed),
-            task.index,
-            task.before,
-            evaluations=task.settings.evaluations,
-            seconds=task.settings.seconds,
-            map=task.map,
-            report=report,
-        )
+    run = multistart_search(
+        space,
+        random_starts(joints, task.m, starts, task.seed),
+        task.index,
+        task.before,
+        evaluations=task.settings.evaluations,
+        seconds=task.settings.seconds,
+        map=task.map,
+        report=report,
     )
+    return _of(run)
 
 
 def _mlsl(task: _Request) -> _Chosen:
     """Look for a set everywhere within the limits, beginning at a random set of candidates."""
     space, joints = _movable(task)
     task.progress(0, 1, "global search")
-    start, effort = random_starts(joints, task.m, 1, task.seed)[0], task.settings
-    return _of(
-        mlsl_search(space, start, task.index, task.before, evaluations=effort.evaluations, seconds=effort.seconds)
-    )
+    [start] = random_starts(joints, task.m, 1, task.seed)
+    effort = task.settings
+    run = mlsl_search(space, start, task.index, task.before, evaluations=effort.evaluations, seconds=effort.seconds)
+    return _of(run)
 
 
 def _movable(task: _Request) -> tuple[SearchSpace, np.ndarray]:
@@ -376,18 +405,18 @@ def _tabu(task: _Request) -> _Chosen:
     def report(chosen: int, _: float) -> None:
         task.progress(chosen, task.m, "poses constructed")
 
-    return _of(
-        tabu_search(
-            task.space,
-            task.m,
-            task.index,
-            task.before,
-            seed=task.seed,
-            rule=task.settings.rule,
-            seconds=task.settings.seconds,
-            report=report,
-        )
+    effort = task.settings
+    run = tabu_search(
+        task.space,
+        task.m,
+        task.index,
+        task.before,
+        seed=task.seed,
+        rule=effort.rule,
+        seconds=effort.seconds,
+        report=report,
     )
+    return _of(run)
 
 
 def _of(run: Improved) -> _Chosen:
@@ -395,23 +424,38 @@ def _of(run: Improved) -> _Chosen:
 
 
 def _selection(task: _Request, chosen: _Chosen, baseline: float, began: float) -> Selection:
-    indices, q = None, chosen.q
+    indices = None
+    q = chosen.q
     if q is None:
         indices = np.array(sorted(chosen.members or ()))
-        jacobians, q = task.jacobians[indices], None if task.q is None else task.q[indices]
+        jacobians = task.jacobians[indices]
+        if task.q is not None:
+            q = task.q[indices]
     else:
-        jacobians = np.asarray(task.space.jacobian(q), dtype=float) if task.space else task.jacobians[:0]
+        jacobians = task.jacobians[:0]
+        if task.space:
+            jacobians = np.asarray(task.space.jacobian(q), dtype=float)
     value = _value(jacobians, task.before, task.index)
     if not value > 0 or not np.isfinite(value):
         raise NotIdentifiable(
             f"no set of {task.m} poses of full rank was found, although the candidates together have it: ask for more "
             "poses"
         )
-    poses = task.m + (0 if task.before is None else len(task.before))
-    ceiling = _ceiling(task, q, 0 if chosen.interrupted else task.settings.climbs)
-    efficiency = _value(jacobians, task.before, "O1") ** 2 * poses / ceiling.upper
-    history = np.exp(np.array(chosen.merits) * (-1.0 if task.index == "cond" else 1.0))
-    history = history / np.sqrt(poses) if task.index == "O1" else history
+    poses = task.m
+    if task.before is not None:
+        poses += len(task.before)
+    climbs = task.settings.climbs
+    if chosen.interrupted:
+        climbs = 0
+    ceiling = _ceiling(task, q, climbs)
+    d_index = _value(jacobians, task.before, "O1")
+    efficiency = d_index**2 * poses / ceiling.upper
+    sign = 1.0
+    if task.index == "cond":
+        sign = -1.0
+    history = np.exp(np.array(chosen.merits) * sign)
+    if task.index == "O1":
+        history = history / np.sqrt(poses)
     history = np.append(history[:-1], value)
     out = Selection(
         q,
@@ -429,7 +473,8 @@ def _selection(task: _Request, chosen: _Chosen, baseline: float, began: float) -
         task.settings.method,
         chosen.interrupted,
     )
-    return replace(out, seconds=time.perf_counter() - began)
+    seconds = time.perf_counter() - began
+    return replace(out, seconds=seconds)
 
 
 def _ceiling(task: _Request, q: np.ndarray | None, climbs: int) -> Ceiling:
@@ -448,6 +493,9 @@ def _ceiling(task: _Request, q: np.ndarray | None, climbs: int) -> Ceiling:
 def _value(jacobians: np.ndarray, existing: np.ndarray | None, index: Index) -> float:
     """Return an index of the chosen and the previously measured Jacobians together."""
     p = jacobians.shape[2]
-    poses = len(jacobians) + (0 if existing is None else len(existing))
-    past = np.zeros((0, p)) if existing is None else existing.reshape(-1, p)
-    return observability(np.concatenate([jacobians.reshape(-1, p), past]), index, poses)
+    if existing is None:
+        return observability(jacobians.reshape(-1, p), index, len(jacobians))
+    poses = len(jacobians) + len(existing)
+    past = existing.reshape(-1, p)
+    stacked = np.concatenate([jacobians.reshape(-1, p), past])
+    return observability(stacked, index, poses)

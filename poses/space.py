@@ -47,7 +47,8 @@ class SearchSpace:
     feasible: Callable[[np.ndarray], np.ndarray] | None = None
 
     def __post_init__(self):
-        lower, upper = np.asarray(self.lower, dtype=float), np.asarray(self.upper, dtype=float)
+        lower = np.asarray(self.lower, dtype=float)
+        upper = np.asarray(self.upper, dtype=float)
         if lower.ndim != 1 or lower.shape != upper.shape or not np.isfinite([lower, upper]).all():
             raise BadInput(f"limits: expected two finite (n,) arrays, found shapes {lower.shape} and {upper.shape}")
         if not (lower < upper).all():
@@ -59,13 +60,17 @@ class SearchSpace:
 
 def is_feasible(space: SearchSpace, q: np.ndarray, tolerance: float = 1e-8) -> np.ndarray:
     """Return whether each pose (m, n) satisfies limits, constraints and predicate, (m,)."""
-    good = np.all((q >= space.lower - tolerance) & (q <= space.upper + tolerance), axis=1)
+    above_lower = q >= space.lower - tolerance
+    below_upper = q <= space.upper + tolerance
+    good = np.all(above_lower & below_upper, axis=1)
     good = np.asarray(good, dtype=bool)
     for constraint in space.constraints:
         if good.any():
-            good[good] = (np.asarray(constraint.function(q[good])) <= tolerance).all(1)
+            values = np.asarray(constraint.function(q[good]))
+            good[good] = (values <= tolerance).all(1)
     if space.feasible is not None and good.any():
-        good[good] = np.asarray(space.feasible(q[good]), dtype=bool)
+        allowed = np.asarray(space.feasible(q[good]), dtype=bool)
+        good[good] = allowed
     return good
 
 
@@ -73,32 +78,40 @@ def product(space: SearchSpace, q: np.ndarray, G: np.ndarray) -> np.ndarray:
     """Return Σ_rp G[i,r,p] ∂J[i,r,p]/∂q[i,k] (m, n): exact if the space provides it, else by central differences."""
     if space.jacobian_product is not None:
         return np.asarray(space.jacobian_product(q, G), dtype=float)
-    return np.einsum("mrp,mkrp->mk", G, central_difference(space.jacobian, q))
+    slopes = central_difference(space.jacobian, q)
+    return np.einsum("mrp,mkrp->mk", G, slopes)
 
 
 def constraint_values(space: SearchSpace, q: np.ndarray) -> np.ndarray:
     """Return all constraints of poses q (m, n), (m, k): kept where ≤ 0."""
-    return np.concatenate([np.zeros((len(q), 0)), *(np.asarray(c.function(q)) for c in space.constraints)], axis=1)
+    empty = np.zeros((len(q), 0))
+    values = [np.asarray(constraint.function(q)) for constraint in space.constraints]
+    return np.concatenate([empty, *values], axis=1)
 
 
 def constraint_gradients(space: SearchSpace, q: np.ndarray) -> np.ndarray:
     """Return the derivatives of `constraint_values` with respect to q, (m, k, n)."""
     empty = np.zeros((len(q), 0, q.shape[1]))
-    return np.concatenate([empty, *(constraint_gradient(c, q) for c in space.constraints)], axis=1)
+    gradients = [constraint_gradient(constraint, q) for constraint in space.constraints]
+    return np.concatenate([empty, *gradients], axis=1)
 
 
 def constraint_gradient(constraint: PoseConstraint, q: np.ndarray) -> np.ndarray:
     """Return ∂c/∂q (m, k, n)."""
     if constraint.gradient is not None:
         return np.asarray(constraint.gradient(q), dtype=float)
-    return central_difference(constraint.function, q).transpose(0, 2, 1)
+    slopes = central_difference(constraint.function, q)
+    return slopes.transpose(0, 2, 1)
 
 
 def central_difference(function: Callable[[np.ndarray], np.ndarray], q: np.ndarray) -> np.ndarray:
     """Return ∂f_i/∂q_ik (m, n, ...) of a function (m, n) -> (m, ...) with independent poses, in one batch."""
     m, n = q.shape
     steps = STEP * np.eye(n)
-    displaced = np.concatenate([q[:, None] + steps, q[:, None] - steps], axis=1).reshape(-1, n)
+    forwards = q[:, None] + steps
+    backwards = q[:, None] - steps
+    displaced = np.concatenate([forwards, backwards], axis=1).reshape(-1, n)
     values = np.asarray(function(displaced), dtype=float)
     values = values.reshape(m, 2, n, *values.shape[1:])
-    return (values[:, 0] - values[:, 1]) / (2 * STEP)
+    difference = values[:, 0] - values[:, 1]
+    return difference / (2 * STEP)

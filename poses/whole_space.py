@@ -80,44 +80,59 @@ def bound_over_space(
         report: called with each round's number and the gap.
     """
     generator = np.random.default_rng([seed, 5])
-    jacobians, climbs_of_round, excess, spent = np.asarray(space.jacobian(q), dtype=float), 0, 0.0, 0
+    jacobians = np.asarray(space.jacobian(q), dtype=float)
+    climbs_of_round = 0
+    excess = 0.0
+    spent = 0
     p = jacobians.shape[2]
     for number in range(max(rounds, 1)):
         candidates = prepared(jacobians, m, existing)
-        weights = relaxed(candidates, m, capped=False, tolerance=0.1 * tolerance).weights
+        relaxation = relaxed(candidates, m, capped=False, tolerance=0.1 * tolerance)
+        weights = relaxation.weights
         matrix = information_of(candidates.z, candidates.known, weights)
         scores = scores_of(candidates.z, matrix)
-        known_trace = float(np.trace(np.linalg.solve(matrix, candidates.known)))
-        logdet, highest = float(log_det(matrix)) + candidates.shift, float(scores.max())
+        known_share = np.linalg.solve(matrix, candidates.known)
+        known_trace = float(np.trace(known_share))
+        logdet = float(log_det(matrix)) + candidates.shift
+        highest = float(scores.max())
         if not climbs:
             break
-        root = candidates.transform @ np.linalg.inv(np.linalg.cholesky(matrix)).T
-        climbs_of_round = (
-            BLOCK
-            if number < rounds - 1 and climbs_of_round < climbs and (number == 0 or excess > tolerance)
-            else climbs
-        )
+        inverse_root = np.linalg.inv(np.linalg.cholesky(matrix))
+        root = candidates.transform @ inverse_root.T
+        # few climbs while poses are still found that join the support, all of them in the end
+        searching = number == 0 or excess > tolerance
+        if number < rounds - 1 and climbs_of_round < climbs and searching:
+            climbs_of_round = BLOCK
+        else:
+            climbs_of_round = climbs
         starts = _starts(space, q, scores, climbs_of_round, generator)
         maxima, steps = _climbed(space, starts, root)
         spent += steps
-        heights = (
-            scores_of(np.asarray(space.jacobian(maxima), dtype=float) @ root, np.eye(p)) if len(maxima) else scores
-        )
-        excess = max(float(heights.max()) / highest - 1.0, 0.0)
-        highest = max(highest, float(heights.max()))
+        heights = scores
+        if len(maxima):
+            maxima_jacobians = np.asarray(space.jacobian(maxima), dtype=float)
+            heights = scores_of(maxima_jacobians @ root, np.eye(p))
+        highest_end = float(heights.max())
+        excess = max(highest_end / highest - 1.0, 0.0)
+        highest = max(highest, highest_end)
+        total = known_trace + m * highest
         if report:
-            report(number, (known_trace + m * highest) / p - 1.0)
+            report(number, total / p - 1.0)
         if excess <= tolerance and climbs_of_round == climbs:
             break
         if len(maxima):
-            better = maxima[heights > float(scores.max()) * (1.0 + 0.1 * tolerance)]
+            threshold = float(scores.max()) * (1.0 + 0.1 * tolerance)
+            better = maxima[heights > threshold]
             q = np.concatenate([q, _apart(better)])
-            jacobians = np.concatenate([jacobians, np.asarray(space.jacobian(q[len(jacobians) :]), dtype=float)])
+            new_jacobians = np.asarray(space.jacobian(q[len(jacobians) :]), dtype=float)
+            jacobians = np.concatenate([jacobians, new_jacobians])
     total = known_trace + m * highest
-    upper = float(np.exp(logdet / p)) * total / p
-    return Ceiling(
-        upper, total / p - 1.0, climbs_of_round if climbs else 0, excess, q[weights[: len(q)].nonzero()[0]], spent
-    )
+    scale = float(np.exp(logdet / p))
+    upper = scale * total / p
+    if not climbs:
+        climbs_of_round = 0
+    support = q[weights[: len(q)].nonzero()[0]]
+    return Ceiling(upper, total / p - 1.0, climbs_of_round, excess, support, spent)
 
 
 def _climbed(space: SearchSpace, starts: np.ndarray, root: np.ndarray) -> tuple[np.ndarray, int]:
@@ -126,34 +141,37 @@ def _climbed(space: SearchSpace, starts: np.ndarray, root: np.ndarray) -> tuple[
     def objective(q: np.ndarray) -> tuple[float, np.ndarray]:
         spread = np.asarray(space.jacobian(q), dtype=float) @ root
         height = (spread**2).sum((1, 2))
-        slope = product(space, q, 2.0 * (spread / height[:, None, None]) @ root.T)
+        relative = spread / height[:, None, None]
+        by_jacobian = 2.0 * relative @ root.T
+        slope = product(space, q, by_jacobian)
         return float(np.log(height).sum()), slope
 
-    ends, spent = [], 0
-    for block in np.array_split(starts, -(-len(starts) // BLOCK)):
+    ends = []
+    spent = 0
+    blocks = -(-len(starts) // BLOCK)
+    for block in np.array_split(starts, blocks):
         end, steps, interrupted = climb(space, block, objective, 100, 1e-3)
         if interrupted:
             raise KeyboardInterrupt
         ends.append(restored(space, end))
         spent += steps * len(block)
     maxima = np.concatenate(ends)
-    return maxima[is_feasible(space, maxima)], spent
+    feasible = is_feasible(space, maxima)
+    return maxima[feasible], spent
 
 
 def _starts(
     space: SearchSpace, q: np.ndarray, scores: np.ndarray, count: int, generator: np.random.Generator
 ) -> np.ndarray:
     """Return start poses: half with the highest d, pairwise distinct, and half at random."""
-    ranked = _apart(q[np.argsort(-scores, kind="stable")[: 20 * count]])[: count - count // 2]
+    order = np.argsort(-scores, kind="stable")[: 20 * count]
+    ranked_count = count - count // 2
+    ranked = _apart(q[order])[:ranked_count]
     random_count = count - len(ranked)
-    return np.concatenate(
-        [
-            ranked,
-            draw_candidates(
-                space.lower, space.upper, random_count, lambda x: is_feasible(space, x), seed=generator, block=256
-            ),
-        ]
+    random_poses = draw_candidates(
+        space.lower, space.upper, random_count, lambda poses: is_feasible(space, poses), seed=generator, block=256
     )
+    return np.concatenate([ranked, random_poses])
 
 
 def _apart(q: np.ndarray) -> np.ndarray:

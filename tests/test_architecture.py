@@ -11,6 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from calib.data.poses import MODELS
+from calib.dynamics.shapes import STEPS
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = [name for name in ("calib", "poses", "trajectories") if (ROOT / name).is_dir()]
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
@@ -205,3 +208,14 @@ def test_every_file_of_the_packages_is_installed():
     }
     there = {path for package in PACKAGES for path in (ROOT / package).rglob("*") if path.is_file()}
     assert {path for path in there if path.suffix != ".py" and "__pycache__" not in path.parts} == installed
+
+
+def test_the_rungs_of_a_ladder_are_named_in_its_table_alone():
+    """Help, schemas and examples of files list the rungs from there."""
+    ladders = {"calib/data/poses/__init__.py": MODELS[4:], "calib/dynamics/shapes.py": tuple(STEPS)}
+    for table, rungs in ladders.items():
+        names = "|".join(rungs)
+        listed = re.compile(rf"\b({names})\b\W{{1,12}}({names})\b\W{{1,12}}({names})\b")
+        places = [str(path.relative_to(ROOT)) for path in sorted((ROOT / "calib").rglob("*.py"))]
+        copies = [place for place in places if place != table and listed.search((ROOT / place).read_text())]
+        assert copies == []

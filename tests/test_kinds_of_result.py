@@ -13,7 +13,7 @@ import pytest
 import calib
 from calib import cli
 from calib.apps.compensation import joint_commands
-from calib.apps.viewer import scene, viewer
+from calib.apps.viewer import viewer
 from calib.config import parse, strict
 from calib.data.poses.fit_options import FitOptions
 from calib.dynamics.torque_rows import POWER
@@ -22,6 +22,7 @@ from calib.parallel.mechanism.closure import closed
 from calib.parallel.mechanism.geometric_fit import changed, loop_parameters
 from calib.parallel.robots import find
 from calib.procedure.kinematic_stage.folder import FitFolder
+from calib.results import scene
 from calib.robot import calibrated, description
 from calib.robot.chain import random_joints
 from calib.robot.library import load

@@ -29,19 +29,28 @@ def straight_approach(
     Raises:
         BadInput: naming the joint and what is wrong with it.
     """
-    start, goal = np.asarray(start, dtype=float), np.asarray(goal, dtype=float)
-    limits = (np.asarray(x, dtype=float) for x in (velocity, acceleration, jerk))
-    bounds: dict[str, np.ndarray] = dict(zip(KINDS, limits))
+    start = np.asarray(start, dtype=float)
+    goal = np.asarray(goal, dtype=float)
+    bounds: dict[str, np.ndarray] = {}
+    for kind, values in zip(KINDS, (velocity, acceleration, jerk)):
+        bounds[kind] = np.asarray(values, dtype=float)
     _check(start, goal, bounds, rate)
     if np.array_equal(start, goal):
         still = np.zeros((1, len(start)))
-        return Setpoints(rate, start[None, :].copy(), still, still.copy())
+        first_row = start[None, :].copy()
+        return Setpoints(rate, first_row, still, still.copy())
     approach = _trajectory(start, goal, bounds)
     count = max(math.ceil(approach.duration * rate - 1e-9), 1)
     stretch = count / rate / approach.duration
-    rows = [approach.at_time(min(t, approach.duration)) for t in np.arange(count + 1) / rate / stretch]
-    q, v, a = (np.array([row[order] for row in rows]) for order in range(3))
-    q[[0, -1]], v[[0, -1]] = (start, goal), 0.0
+    rows = []
+    for t in np.arange(count + 1) / rate / stretch:
+        row = approach.at_time(min(t, approach.duration))
+        rows.append(row)
+    q = np.array([row[0] for row in rows])
+    v = np.array([row[1] for row in rows])
+    a = np.array([row[2] for row in rows])
+    q[[0, -1]] = (start, goal)
+    v[[0, -1]] = 0.0
     return Setpoints(rate, q, v / stretch, a / stretch**2)
 
 
@@ -49,8 +58,11 @@ def _trajectory(start: np.ndarray, goal: np.ndarray, bounds: dict[str, np.ndarra
     import ruckig
 
     request = ruckig.InputParameter(len(start))
-    request.current_position, request.target_position = start.tolist(), goal.tolist()
-    request.max_velocity, request.max_acceleration, request.max_jerk = (bounds[kind].tolist() for kind in KINDS)
+    request.current_position = start.tolist()
+    request.target_position = goal.tolist()
+    request.max_velocity = bounds["velocity"].tolist()
+    request.max_acceleration = bounds["acceleration"].tolist()
+    request.max_jerk = bounds["jerk"].tolist()
     request.synchronization = ruckig.Synchronization.Phase
     result = ruckig.Trajectory(len(start))
     result_code = ruckig.Ruckig(len(start)).calculate(request, result)

@@ -51,7 +51,7 @@ class SampledMotion:
 
     def part(self, rows: np.ndarray) -> SampledMotion:
         """Return the samples of the given indices."""
-        return SampledMotion(self.times[rows], *(x[rows] for x in self.orders))
+        return SampledMotion(self.times[rows], self.q[rows], self.v[rows], self.a[rows], self.jerk[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,23 +84,28 @@ class Basis:
         spread = np.zeros(self.used.shape)
         spread[self.used] = x
         n, _, count, c = self.tables.shape
-        displacement = (self.tables.reshape(n, 4 * count, c) @ spread[:, :, None]).reshape(n, 4, count)
-        return SampledMotion(self.times, *(self.offsets + displacement.transpose(1, 2, 0)))
+        joint_tables = self.tables.reshape(n, 4 * count, c)
+        by_joint = joint_tables @ spread[:, :, None]
+        displacement = by_joint.reshape(n, 4, count)
+        orders = self.offsets + displacement.transpose(1, 2, 0)
+        return SampledMotion(self.times, *orders)
 
     def nearest(self, q: np.ndarray) -> np.ndarray:
         """Return the variables (p,) whose positions come nearest to q (N, n): least squares over the times."""
         variables = np.zeros(self.used.shape)
         for j, exists in enumerate(self.used):
-            variables[j, exists] = np.linalg.lstsq(
-                self.tables[j, 0][:, exists], q[:, j] - self.offsets[0, :, j], rcond=None
-            )[0]
+            position_table = self.tables[j, 0][:, exists]
+            displacement = q[:, j] - self.offsets[0, :, j]
+            variables[j, exists] = np.linalg.lstsq(position_table, displacement, rcond=None)[0]
         return variables[self.used]
 
     def adjoint(self, slopes: np.ndarray) -> np.ndarray:
         """Return gradients (m, p) in x of m functions, from their gradients (m, 4, N, n) in q, v, a, jerk."""
         m, _, count, n = slopes.shape
-        flat = slopes.transpose(3, 0, 1, 2).reshape(n, m, 4 * count)
-        gradients = flat @ self.tables.reshape(n, 4 * count, -1)
+        by_joint = slopes.transpose(3, 0, 1, 2)
+        flat = by_joint.reshape(n, m, 4 * count)
+        joint_tables = self.tables.reshape(n, 4 * count, -1)
+        gradients = flat @ joint_tables
         return gradients.transpose(1, 0, 2)[:, self.used]
 
 
@@ -130,7 +135,8 @@ class Freedom:
 def freedom(rows: np.ndarray, values: np.ndarray) -> Freedom:
     """Return a solution of rows (e, C) · coefficients = values (e,), and an orthonormal basis of the null space."""
     if not len(rows):
-        return Freedom(np.zeros(rows.shape[1]), np.eye(rows.shape[1]))
+        parameters = rows.shape[1]
+        return Freedom(np.zeros(parameters), np.eye(parameters))
     particular = np.linalg.lstsq(rows, values, rcond=None)[0]
     if not np.allclose(rows @ particular, values, atol=1e-9):
         raise BadInput("a joint has too few coefficients to start at rest at the given pose: allow more harmonics")
@@ -157,14 +163,16 @@ def holding(
             raise BadInput(f"joint {j + 1} of {len(values)} cannot be held at {value:g}")
         if start is not None and start[j] != value:
             raise BadInput(f"joint {j + 1} is held at {value:g}, but the motion starts from {start[j]:g}")
-        values[j], first[j] = none, float(value)
+        values[j] = none
+        first[j] = float(value)
     return tuple(values), first
 
 
 def assemble(times: np.ndarray, tables: Sequence[np.ndarray], freedoms: Sequence[Freedom]) -> Basis:
     """Return the basis from the joints' coefficient tables (4, N, C_j) and equations."""
     n = len(tables)
-    widest = max(1, *(free.null.shape[1] for free in freedoms))
+    widths = [free.null.shape[1] for free in freedoms]
+    widest = max(1, *widths)
     offsets = np.zeros((4, len(times), n))
     stacked = np.zeros((n, 4, len(times), widest))
     used = np.zeros((n, widest), dtype=bool)
@@ -185,15 +193,18 @@ def counts_of_joints(counts: int | Sequence[int], joints: int | None) -> tuple[i
 
 def joined(freedoms: Sequence[Freedom], x: np.ndarray) -> tuple[np.ndarray, ...]:
     """Return the coefficients (C_j,) of every joint for variables x."""
-    ends = np.cumsum([free.null.shape[1] for free in freedoms])[:-1]
-    return tuple(free.particular + free.null @ part for free, part in zip(freedoms, np.split(x, ends)))
+    widths = [free.null.shape[1] for free in freedoms]
+    ends = np.cumsum(widths)[:-1]
+    parts = np.split(x, ends)
+    return tuple(free.particular + free.null @ part for free, part in zip(freedoms, parts))
 
 
 def projected(freedoms: Sequence[Freedom], coefficients: Sequence[np.ndarray]) -> np.ndarray:
     """Return the variables whose coefficients are nearest to the given ones."""
     variables = []
     for free, values in zip(freedoms, coefficients):
-        variables.append(free.null.T @ (np.asarray(values) - free.particular))
+        displacement = np.asarray(values) - free.particular
+        variables.append(free.null.T @ displacement)
     return np.concatenate(variables)
 
 
@@ -210,7 +221,9 @@ def aligned_period(period: float, rate: float) -> int:
     """
     count = period * rate
     if not np.isfinite(count) or count < 1 or abs(count - round(count)) > 1e-6:
-        nearest = max(1, round(count)) / rate if np.isfinite(count) else float("nan")
+        nearest = float("nan")
+        if np.isfinite(count):
+            nearest = max(1, round(count)) / rate
         raise BadInput(
             f"a period of {period:g} s is {count:g} samples at {rate:g} Hz, not a whole number: periods could not be "
             f"averaged sample by sample; take {nearest:.12g} s"

@@ -51,12 +51,15 @@ class BSpline:
         result = np.zeros((len(times), self.n))
         for j, (count, points) in enumerate(zip(self.counts, self.coefficients(x))):
             if count == 1:
-                result[:, j] = points[0] if order == 0 else 0.0
+                if order == 0:
+                    result[:, j] = points[0]
                 continue
-            knots = self.period / count * np.arange(-self.degree, count + self.degree + 1)
+            knot_numbers = np.arange(-self.degree, count + self.degree + 1)
+            knots = self.period / count * knot_numbers
             periodic_points = np.concatenate([points, points[: self.degree]])
             spline = ScipyBSpline(knots, periodic_points, self.degree)
-            result[:, j] = spline(np.mod(times, self.period), nu=order)
+            phases = np.mod(times, self.period)
+            result[:, j] = spline(phases, nu=order)
         return result
 
     def largest(self, x: np.ndarray, order: int) -> np.ndarray:
@@ -68,7 +71,8 @@ class BSpline:
         bounds = []
         for count, points in zip(self.counts, self.coefficients(x)):
             for _ in range(order):
-                points = (points - np.roll(points, 1)) * count / self.period
+                difference = points - np.roll(points, 1)
+                points = difference * count / self.period
             bounds.append(np.abs(points).max())
         return np.array(bounds)
 
@@ -115,8 +119,10 @@ def bspline_family(
         if rest and count > 1:
             orders += [1, 2]
             values += [0.0, 0.0]
-        at_start = _table(np.zeros(1), period, count, degree)[:, 0]
-        freedoms.append(freedom(at_start[orders], np.array(values)))
+        start_table = _table(np.zeros(1), period, count, degree)
+        at_start = start_table[:, 0]
+        equations = at_start[orders]
+        freedoms.append(freedom(equations, np.array(values)))
     return BSpline(float(period), counts, degree, tuple(freedoms))
 
 
@@ -130,6 +136,10 @@ def _table(times: np.ndarray, period: float, count: int, degree: int) -> np.ndar
     phases = np.mod(times, period)
     splines = ScipyBSpline(knots, np.eye(count + degree), degree)
     for order in range(4):
-        values = splines.derivative(order)(phases) if order else splines(phases)
-        np.add.at(result[order].T, np.arange(count + degree) % count, values.T)
+        spline = splines
+        if order:
+            spline = splines.derivative(order)
+        values = spline(phases)
+        columns = np.arange(count + degree) % count
+        np.add.at(result[order].T, columns, values.T)
     return result

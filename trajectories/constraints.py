@@ -24,6 +24,7 @@ Slopes = tuple[np.ndarray, np.ndarray, np.ndarray]
 Product = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], Slopes]
 TorqueProduct = Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray], Slopes]
 UNITS = ("rad", "rad/s", "rad/s²", "rad/s³")
+LINEAR_UNITS = ("m", "m/s", "m/s²", "m/s³")
 
 
 class MotionConstraint(Protocol):
@@ -65,7 +66,10 @@ class TwoSided:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        names = [self.rows[j] if self.rows else f"joint {j + 1}" for j in self.joints]
+        if self.rows:
+            names = [self.rows[j] for j in self.joints]
+        else:
+            names = [f"joint {j + 1}" for j in self.joints]
         return tuple(f"{name} {side}" for side in ("upper", "lower") for name in names)
 
     @property
@@ -92,7 +96,8 @@ class BoxLimit(TwoSided):
     joints: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
-        lower, upper = np.asarray(self.lower, dtype=float), np.asarray(self.upper, dtype=float)
+        lower = np.asarray(self.lower, dtype=float)
+        upper = np.asarray(self.upper, dtype=float)
         kind = ORDERS[self.order]
         if lower.shape != upper.shape or lower.ndim != 1 or np.isnan(lower).any() or np.isnan(upper).any():
             raise BadInput(f"{kind} limits: expected two (n,) arrays of numbers, found {lower} and {upper}")
@@ -107,7 +112,8 @@ class BoxLimit(TwoSided):
         object.__setattr__(self, "lower", lower)
         object.__setattr__(self, "upper", upper)
         object.__setattr__(self, "unit", self.unit or UNITS[self.order])
-        object.__setattr__(self, "joints", np.flatnonzero(np.isfinite(lower) & np.isfinite(upper)))
+        limited = np.isfinite(lower) & np.isfinite(upper)
+        object.__setattr__(self, "joints", np.flatnonzero(limited))
 
     @property
     def name(self) -> str:
@@ -115,16 +121,20 @@ class BoxLimit(TwoSided):
 
     @property
     def scale(self) -> np.ndarray:
-        return np.tile((self.upper - self.lower)[self.joints] / 2, 2)
+        half_range = (self.upper - self.lower)[self.joints] / 2
+        return np.tile(half_range, 2)
 
     def values(self, motion: SampledMotion) -> np.ndarray:
         x = motion.orders[self.order][:, self.joints]
-        return np.concatenate([x - self.upper[self.joints], self.lower[self.joints] - x], axis=1)
+        above = x - self.upper[self.joints]
+        below = self.lower[self.joints] - x
+        return np.concatenate([above, below], axis=1)
 
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
         result = np.zeros((4, *motion.q.shape))
         k = len(self.joints)
-        result[self.order][:, self.joints] = weights[:, :k] - weights[:, k:]
+        signed = weights[:, :k] - weights[:, k:]
+        result[self.order][:, self.joints] = signed
         return result
 
 
@@ -170,15 +180,18 @@ class TorqueLimit(TwoSided):
 
     def values(self, motion: SampledMotion) -> np.ndarray:
         Y = motion.evaluated(self.regressor)
-        torque, bound = (Y @ self.parameters)[:, self.joints], (1 - self.margin) * self.limits[self.joints]
+        torque = (Y @ self.parameters)[:, self.joints]
+        bound = (1 - self.margin) * self.limits[self.joints]
         if self.covariance is not None:
             Y = Y[:, self.joints]
-            bound = bound - self.deviations * np.sqrt(np.einsum("njb,njb->nj", Y @ self.covariance, Y))
+            variance = np.einsum("njb,njb->nj", Y @ self.covariance, Y)
+            bound = bound - self.deviations * np.sqrt(variance)
         return np.concatenate([torque - bound, -torque - bound], axis=1)
 
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
         k = len(self.joints)
-        signed, result = np.zeros((len(motion), len(self.limits))), np.zeros((4, *motion.q.shape))
+        signed = np.zeros((len(motion), len(self.limits)))
+        result = np.zeros((4, *motion.q.shape))
         signed[:, self.joints] = weights[:, :k] - weights[:, k:]
         if self.covariance is None and self.torque_product is not None:
             result[:3] = self.torque_product(motion.q, motion.v, motion.a, self.parameters, signed)
@@ -187,8 +200,10 @@ class TorqueLimit(TwoSided):
         if self.covariance is not None:
             Y = self.regressor(motion.q, motion.v, motion.a)[:, self.joints]
             spread_rows = Y @ self.covariance
-            spread = np.sqrt(np.maximum(np.einsum("njb,njb->nj", spread_rows, Y), 1e-30))
-            factor = self.deviations * (weights[:, :k] + weights[:, k:]) / spread
+            variance = np.einsum("njb,njb->nj", spread_rows, Y)
+            spread = np.sqrt(np.maximum(variance, 1e-30))
+            both_sides = weights[:, :k] + weights[:, k:]
+            factor = self.deviations * both_sides / spread
             G[:, self.joints] += factor[:, :, None] * spread_rows
         result[:3] = self.product(motion.q, motion.v, motion.a, G)
         return result
@@ -203,14 +218,17 @@ def box_limits(
     linear: Sequence[bool] | None = None,
 ) -> tuple[BoxLimit, ...]:
     """Return the limits of position (lower, upper) and of the moduli of velocity, acceleration and jerk, each (n,)."""
-    units = UNITS if not linear or not all(linear) else ("m", "m/s", "m/s²", "m/s³")
+    units = UNITS
+    if linear and all(linear):
+        units = LINEAR_UNITS
     limits = [BoxLimit(0, lower, upper, units[0])]
     for order, bound in enumerate((velocity, acceleration, jerk), 1):
         if bound is None:
             continue
         sizes = np.asarray(bound, dtype=float)
         if not (sizes > 0).all():
-            j = int(np.argmin(np.where(np.isnan(sizes), -1.0, sizes)))
+            below_zero_if_nan = np.where(np.isnan(sizes), -1.0, sizes)
+            j = int(np.argmin(below_zero_if_nan))
             raise BadInput(
                 f"{ORDERS[order]} limit of joint {j + 1} is {sizes[j]:g}: it must be above zero; a joint that may "
                 "not move is locked with 0 harmonics"
@@ -227,21 +245,25 @@ class Smoothed(NamedTuple):
         values: (r,) c of its groups.
         excess: max g / scale + tightening.
         shares: (N, k) of each sample and column in its group's slope.
-        own: (r, k) which columns are a group's.
+        in_group: (r, k) which columns are a group's.
     """
 
     constraint: MotionConstraint
     values: np.ndarray
     excess: float
     shares: np.ndarray
-    own: np.ndarray
+    in_group: np.ndarray
 
     def slopes(self, motion: SampledMotion) -> np.ndarray:
         """Return the gradients (r, 4, N, n) of the values in q, v, a, jerk of the motion."""
-        group, row = np.nonzero((self.own[:, None] & (self.shares > 1e-9)).any(axis=2))  # nine digits without the rest
-        weights = np.where(self.own[group], self.shares[row] / self.constraint.scale, 0.0)
-        result = np.zeros((len(self.own), 4, *motion.q.shape))
-        result[group, :, row] = self.constraint.slopes(motion.part(row), weights).transpose(1, 0, 2)
+        # nine digits without the small shares
+        counts = self.in_group[:, None] & (self.shares > 1e-9)
+        group, row = np.nonzero(counts.any(axis=2))
+        scaled_shares = self.shares[row] / self.constraint.scale
+        weights = np.where(self.in_group[group], scaled_shares, 0.0)
+        result = np.zeros((len(self.in_group), 4, *motion.q.shape))
+        slopes = self.constraint.slopes(motion.part(row), weights)
+        result[group, :, row] = slopes.transpose(1, 0, 2)
         return result
 
 
@@ -255,10 +277,12 @@ def smoothed(
         tightening: added to every value, as a share of its scale.
     """
     scaled = constraint.values(motion) / constraint.scale + tightening
-    groups, count = constraint.groups, int(constraint.groups.max()) + 1
+    groups = constraint.groups
+    count = int(constraint.groups.max()) + 1
     in_group = groups == np.arange(count)[:, None]  # (r, k)
     top = np.array([scaled[:, columns].max() for columns in in_group])
     shares = np.exp(sharpness * (scaled - top[groups]))
     total = in_group @ shares.sum(axis=0)
     shares /= total[groups]
-    return Smoothed(constraint, top + np.log(total) / sharpness, float(top.max()), shares, in_group)
+    values = top + np.log(total) / sharpness
+    return Smoothed(constraint, values, float(top.max()), shares, in_group)

@@ -34,7 +34,8 @@ class Fourier:
 
     def basis(self, times: np.ndarray) -> Basis:
         """Return the family at times (N,) [s]."""
-        return assemble(times, [_table(times, self.period, count) for count in self.harmonics], self.freedoms)
+        tables = [_table(times, self.period, count) for count in self.harmonics]
+        return assemble(times, tables, self.freedoms)
 
     def coefficients(self, x: np.ndarray) -> tuple[np.ndarray, ...]:
         """Return q0, a, b (1 + 2 n_f,) of every joint."""
@@ -53,7 +54,9 @@ class Fourier:
         bounds = []
         for count, c in zip(self.harmonics, self.coefficients(x)):
             rates = 2 * np.pi / self.period * np.arange(1, count + 1)
-            bounds.append((rates**order * np.hypot(c[1 : 1 + count], c[1 + count :])).sum())
+            sizes = np.hypot(c[1 : 1 + count], c[1 + count :])
+            bound = (rates**order * sizes).sum()
+            bounds.append(bound)
         return np.array(bounds)
 
     def random(self, rng: np.random.Generator, centre: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
@@ -61,8 +64,10 @@ class Fourier:
         coefficients = []
         for count, middle, size in zip(self.harmonics, centre, amplitude):
             fall = 1.0 / np.arange(1, count + 1)
-            fall = fall / max(np.sqrt((fall**2).sum()), 1.0)
-            coefficients.append(np.concatenate([[middle], size * np.tile(fall, 2) * rng.normal(size=2 * count)]))
+            norm = np.sqrt((fall**2).sum())
+            fall = fall / max(norm, 1.0)
+            scale = size * np.tile(fall, 2)
+            coefficients.append(np.concatenate([[middle], scale * rng.normal(size=2 * count)]))
         return self.variables(coefficients)
 
 
@@ -135,7 +140,9 @@ def evaluate(coefficients: Sequence[np.ndarray], period: float, times: np.ndarra
     result = np.zeros((len(times), len(coefficients)))
     for j, c in enumerate(coefficients):
         count = len(c) // 2
-        result[:, j] = sine[:, :count] @ c[1 : 1 + count] + cosine[:, :count] @ c[1 + count :]
+        by_sine = sine[:, :count] @ c[1 : 1 + count]
+        by_cosine = cosine[:, :count] @ c[1 + count :]
+        result[:, j] = by_sine + by_cosine
         if order == 0:
             result[:, j] += c[0]
     return result
@@ -143,14 +150,20 @@ def evaluate(coefficients: Sequence[np.ndarray], period: float, times: np.ndarra
 
 def _freedom(count: int, period: float, rest: bool, start: float | None) -> Freedom:
     k = np.arange(1, count + 1)
-    rows, values = list[np.ndarray](), list[float]()
+    rows = list[np.ndarray]()
+    values = list[float]()
     if rest and count:
-        rows += [np.r_[0.0, k, np.zeros(count)], np.r_[0.0, np.zeros(count), k**2]]
+        zeros = np.zeros(count)
+        velocity = np.r_[0.0, k, zeros]
+        acceleration = np.r_[0.0, zeros, k**2]
+        rows += [velocity, acceleration]
         values += [0.0, 0.0]
     if start is not None:
-        rows.append(np.r_[1.0, np.zeros(count), np.ones(count)])
+        position = np.r_[1.0, np.zeros(count), np.ones(count)]
+        rows.append(position)
         values.append(start)
-    return freedom(np.array(rows).reshape(len(rows), 1 + 2 * count), np.array(values))
+    equations = np.array(rows).reshape(len(rows), 1 + 2 * count)
+    return freedom(equations, np.array(values))
 
 
 def _check_frequencies(counts: Sequence[int], period: float, resonance: float | None) -> None:

@@ -23,7 +23,8 @@ def joint_trajectory(
     if len(joint_names) != track.n or len(set(joint_names)) != track.n:
         raise BadInput(f"the motion has {track.n} joints, the given names are {', '.join(joint_names) or 'none'}")
     require(every >= 1, f"every {every}: expected 1 or more")
-    rows = np.unique(np.append(np.arange(0, len(track), every), len(track) - 1))
+    numbers = np.append(np.arange(0, len(track), every), len(track) - 1)
+    rows = np.unique(numbers)
     points = [_point(track, int(k)) for k in rows]
     return {
         "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": frame},
@@ -34,15 +35,18 @@ def joint_trajectory(
 
 def to_json(message: dict[str, object]) -> str:
     """Return the message as JSON, one point per line."""
-    points = ",\n".join("    " + json.dumps(point, allow_nan=False) for point in message["points"])
-    head = json.dumps({key: message[key] for key in ("header", "joint_names")}, indent=2)[:-2]
+    lines = ["    " + json.dumps(point, allow_nan=False) for point in message["points"]]
+    points = ",\n".join(lines)
+    header = {key: message[key] for key in ("header", "joint_names")}
+    head = json.dumps(header, indent=2)[:-2]
     return f'{head},\n  "points": [\n{points}\n  ]\n}}\n'
 
 
 def to_yaml(message: dict[str, object]) -> str:
     """Return the message as YAML; numbers always with a decimal point, since YAML 1.1 reads 1e-05 as text."""
     stamp = message["header"]["stamp"]
-    names = ", ".join(json.dumps(name) for name in message["joint_names"])
+    quoted = [json.dumps(name) for name in message["joint_names"]]
+    names = ", ".join(quoted)
     lines = [
         "header:",
         f"  stamp: {{sec: {stamp['sec']}, nanosec: {stamp['nanosec']}}}",
@@ -67,12 +71,13 @@ def _point(track: Setpoints, k: int) -> dict[str, object]:
     effort = []
     if track.tau is not None:
         effort = _rounded(track.tau[k])
+    seconds, remaining_nanoseconds = divmod(nanoseconds, 10**9)
     return {
         "positions": _rounded(track.q[k]),
         "velocities": _rounded(track.v[k]),
         "accelerations": _rounded(track.a[k]),
         "effort": effort,
-        "time_from_start": {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9},
+        "time_from_start": {"sec": seconds, "nanosec": remaining_nanoseconds},
     }
 
 

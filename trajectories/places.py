@@ -1,8 +1,7 @@
 """Constraints on the arm's place: positions of the tool and of named points, and distances between bodies.
 
 Places and distances come from callables with derivative products; see `calib.trajectories.constraints` for what a
-constraint
-has.
+constraint has.
 """
 
 from collections.abc import Callable
@@ -40,12 +39,21 @@ class Workspace:
 
     @property
     def _kinds(self) -> tuple[str, ...]:
-        kinds = (("distance from the axis", self.radius), ("lowest", self.lowest), ("highest", self.highest))
-        return tuple(kind for kind, bound in kinds if bound is not None)
+        kinds = []
+        if self.radius is not None:
+            kinds.append("distance from the axis")
+        if self.lowest is not None:
+            kinds.append("lowest")
+        if self.highest is not None:
+            kinds.append("highest")
+        return tuple(kinds)
 
     @property
     def labels(self) -> tuple[str, ...]:
-        return tuple(f"{name} {kind}" for kind in self._kinds for name in self.names)
+        labels = []
+        for kind in self._kinds:
+            labels += [f"{name} {kind}" for name in self.names]
+        return tuple(labels)
 
     @property
     def scale(self) -> np.ndarray:
@@ -60,7 +68,8 @@ class Workspace:
         height = x[..., 2]
         values = []
         if self.radius is not None:
-            shortfall = self.radius**2 - (x[..., :2] ** 2).sum(-1)
+            squared_radius = (x[..., :2] ** 2).sum(-1)
+            shortfall = self.radius**2 - squared_radius
             values.append(shortfall / (2 * max(self.radius, MIN_RADIUS)))
         if self.lowest is not None:
             values.append(self.lowest - height)
@@ -72,10 +81,12 @@ class Workspace:
         x = self.points(motion.q)
         G = np.zeros_like(x)
         none = np.zeros(len(self.names))
-        parts = dict(zip(self._kinds, np.split(weights, len(self._kinds), axis=1)))
+        weights_by_kind = np.split(weights, len(self._kinds), axis=1)
+        parts = dict(zip(self._kinds, weights_by_kind))
         if self.radius is not None:
             by_radius = parts["distance from the axis"][..., None]
-            G[..., :2] -= by_radius * x[..., :2] / max(self.radius, MIN_RADIUS)
+            by_position = by_radius * x[..., :2] / max(self.radius, MIN_RADIUS)
+            G[..., :2] -= by_position
         G[..., 2] += parts.get("highest", none) - parts.get("lowest", none)
         result = np.zeros((4, *motion.q.shape))
         result[0] = self.product(motion.q, G)
@@ -112,7 +123,7 @@ class Clearance:
 
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
         result = np.zeros((4, *motion.q.shape))
-        # each pair asks for its own
+        # each time once, however many pairs are asked for there
         _, rows, row_of_time = np.unique(motion.times, return_index=True, return_inverse=True)
         gradients = self.gradients(motion.q[rows])[row_of_time]
         result[0] = -np.einsum("mk,mkn->mn", weights, gradients)

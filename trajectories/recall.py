@@ -72,7 +72,8 @@ def find_periods(recorded: np.ndarray, reference: np.ndarray, skip: int = 0, lik
     Raises:
         BadInput: where it is not there, with the nearest thing that is.
     """
-    q, r = np.asarray(recorded, dtype=float), np.asarray(reference, dtype=float)
+    q = np.asarray(recorded, dtype=float)
+    r = np.asarray(reference, dtype=float)
     if q.ndim != 2 or r.ndim != 2 or q.shape[1] != r.shape[1]:
         raise BadInput(f"recording {q.shape} and reference {r.shape} need the same number of columns, one per joint")
     if not (np.isfinite(q).all() and np.isfinite(r).all()):
@@ -86,33 +87,43 @@ def find_periods(recorded: np.ndarray, reference: np.ndarray, skip: int = 0, lik
             f"the motion is not in the recording: the nearest {len(r)} samples begin at {best} and explain "
             f"{max(similarity[best], 0.0):.0%} of its variance; check the rate, the joint order and the units"
         )
-    chain = [k for k in range(best % len(r), len(similarity), len(r)) if similarity[k] >= likeness]
+    offsets = range(best % len(r), len(similarity), len(r))
+    chain = [k for k in offsets if similarity[k] >= likeness]
     run = _run_with(chain, best, len(r))[skip:]
     require(run, f"the recording contains fewer than {skip + 1} whole periods of the motion")
-    return Recalled(run[0], len(r), len(run), tuple(float(similarity[k]) for k in run), _lag(similarity, best))
+    likenesses = tuple(float(similarity[k]) for k in run)
+    return Recalled(run[0], len(r), len(run), likenesses, _lag(similarity, best))
 
 
 def average(values: np.ndarray, mean: Recalled) -> Averaged:
     """Return mean and variance of signals (N, k) over the complete periods of a recording (at least two)."""
     require(mean.periods >= 2, "one period has no variance: record two or more")
-    parts = np.asarray(values, dtype=float)[mean.rows].reshape(mean.periods, mean.period, -1)
-    return Averaged(parts.mean(axis=0), parts.var(axis=0, ddof=1), mean.periods)
+    signals = np.asarray(values, dtype=float)[mean.rows]
+    parts = signals.reshape(mean.periods, mean.period, -1)
+    variance = parts.var(axis=0, ddof=1)
+    return Averaged(parts.mean(axis=0), variance, mean.periods)
 
 
 def _likeness(q: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Return 1 - D(k) / Σ |r - mean|² at every offset (N - P + 1,)."""
     centre = r.mean(axis=0)
-    q, r = q - centre, r - centre
-    energy = np.concatenate([[0.0], np.cumsum((q**2).sum(axis=1))])
+    q = q - centre
+    r = r - centre
+    squares = np.cumsum((q**2).sum(axis=1))
+    energy = np.concatenate([[0.0], squares])
     overlap = energy[len(r) :] - energy[: -len(r)]
     crossed = sum(sliding_products(q[:, j], r[:, j]) for j in range(q.shape[1]))
-    return 1.0 - (overlap + (r**2).sum() - 2 * crossed) / max((r**2).sum(), 1e-300)
+    reference_energy = (r**2).sum()
+    distance = overlap + reference_energy - 2 * crossed
+    return 1.0 - distance / max(reference_energy, 1e-300)
 
 
 def sliding_products(x: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Return Σ_i x[k + i] r[i] for every offset k (N - P + 1,) of r (P,) in x (N,), by FFT."""
     size = next_fast_len(len(x) + len(r) - 1, real=True)
-    return np.fft.irfft(np.fft.rfft(x, size) * np.fft.rfft(r[::-1], size), size)[len(r) - 1 : len(x)]
+    spectrum = np.fft.rfft(x, size) * np.fft.rfft(r[::-1], size)
+    products = np.fft.irfft(spectrum, size)
+    return products[len(r) - 1 : len(x)]
 
 
 def _run_with(places: list[int], best: int, period: int) -> list[int]:
@@ -132,4 +143,7 @@ def _lag(similarity: np.ndarray, best: int) -> float:
         return 0.0
     before, lag_index, after = similarity[best - 1 : best + 2]
     bend = before - 2 * lag_index + after
-    return 0.0 if bend >= 0 else float(np.clip(0.5 * (before - after) / bend, -0.5, 0.5))
+    if bend >= 0:
+        return 0.0
+    peak = 0.5 * (before - after) / bend
+    return float(np.clip(peak, -0.5, 0.5))

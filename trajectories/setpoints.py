@@ -74,7 +74,9 @@ def joined(tracks: Sequence[Setpoints]) -> Setpoints:
         a.append(track.a[rows])
         if track.tau is not None:
             tau.append(track.tau[rows])
-    torques = np.vstack(tau) if len(tau) == len(tracks) else None
+    torques = None
+    if len(tau) == len(tracks):
+        torques = np.vstack(tau)
     return Setpoints(rate, np.vstack(q), np.vstack(v), np.vstack(a), torques)
 
 
@@ -107,8 +109,10 @@ def slowed(track: Setpoints, factor: float) -> Setpoints:
     k = np.minimum(position.astype(int), last - 1)
     x = (position - k)[:, None]
     step = 1 / track.rate
-    q0, q1 = track.q[k], track.q[k + 1]
-    v0, v1 = step * track.v[k], step * track.v[k + 1]
+    q0 = track.q[k]
+    q1 = track.q[k + 1]
+    v0 = step * track.v[k]
+    v1 = step * track.v[k + 1]
     bend = 3 * (q1 - q0) - 2 * v0 - v1
     twist = 2 * (q0 - q1) + v0 + v1
     q = q0 + x * (v0 + x * (bend + x * twist))

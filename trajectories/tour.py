@@ -19,7 +19,9 @@ def move_times(start: np.ndarray, end: np.ndarray, velocity: np.ndarray, acceler
     """
     distance = np.abs(end - start)
     full = distance >= velocity**2 / acceleration
-    times = np.where(full, distance / velocity + velocity / acceleration, 2.0 * np.sqrt(distance / acceleration))
+    trapezoid = distance / velocity + velocity / acceleration
+    triangle = 2.0 * np.sqrt(distance / acceleration)
+    times = np.where(full, trapezoid, triangle)
     return times.max(axis=-1)
 
 
@@ -55,13 +57,15 @@ def tour(times: np.ndarray, first: int | None = None) -> np.ndarray:
     best = None
     shortest = np.inf
     for start in starts:
-        order = _improved(np.array([*_nearest_first(cost, start), count]), closed)
+        order = np.array([*_nearest_first(cost, start), count])
+        order = _improved(order, closed)
         length = closed[order, np.roll(order, -1)].sum()
         if length < shortest:
             best = order
             shortest = length
     assert best is not None
-    order = np.roll(best, -int(np.argmax(best == count)))[1:]
+    stop_index = int(np.argmax(best == count))
+    order = np.roll(best, -stop_index)[1:]
     if first is not None and order[0] != first:
         return order[::-1]
     return order
@@ -94,7 +98,9 @@ def _reversed(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
     """Return the tour after the reversal that saves most: edges a-b and c-d become a-c and b-d."""
     after = np.roll(order, -1)
     edge = cost[order, after]
-    gains = np.triu(edge[:, None] + edge - cost[order[:, None], order] - cost[after[:, None], after], 2)
+    between_starts = cost[order[:, None], order]
+    between_ends = cost[after[:, None], after]
+    gains = np.triu(edge[:, None] + edge - between_starts - between_ends, 2)
     i, k = divmod(int(gains.argmax()), len(order))
     if gains[i, k] <= 1e-9:
         return None
@@ -103,21 +109,32 @@ def _reversed(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
 
 def _relocated(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
     """Return the tour after moving up to three successive places, reversed or not, for the largest saving."""
-    count, best = len(order), (1e-9, 0, 0, 0, False)
+    count = len(order)
+    best = (1e-9, 0, 0, 0, False)
     after = np.roll(order, -1)
     edge = cost[order, after]
     for size in range(1, min(3, count - 2) + 1):
-        before, last, behind = np.roll(order, 1), np.roll(order, 1 - size), np.roll(order, -size)
+        before = np.roll(order, 1)
+        last = np.roll(order, 1 - size)
+        behind = np.roll(order, -size)
         saved = cost[before, order] + cost[last, behind] - cost[before, behind]
-        inside = (np.arange(count) - np.arange(count)[:, None] + 1) % count <= size  # edges at the part itself
+        positions = np.arange(count)
+        # edges at the part itself
+        part_edges = (positions - positions[:, None] + 1) % count <= size
         for turned, (first, second) in enumerate(((order, last), (last, order))):
-            gains = saved[:, None] + edge - cost[first[:, None], order] - cost[second[:, None], after]
-            gains[inside] = 0.0
+            first_edges = cost[first[:, None], order]
+            second_edges = cost[second[:, None], after]
+            gains = saved[:, None] + edge - first_edges - second_edges
+            gains[part_edges] = 0.0
             i, k = divmod(int(gains.argmax()), count)
-            best = max(best, (float(gains[i, k]), size, i, (k - i - size) % count, bool(turned)))
+            move = (float(gains[i, k]), size, i, (k - i - size) % count, bool(turned))
+            best = max(best, move)
     _, size, i, k, turned = best
     if not size:
         return None
-    inside = np.roll(order, -i)
-    part, remaining = inside[:size], inside[size:]
-    return np.concatenate([remaining[: k + 1], part[::-1] if turned else part, remaining[k + 1 :]])
+    rotated = np.roll(order, -i)
+    part = rotated[:size]
+    remaining = rotated[size:]
+    if turned:
+        part = part[::-1]
+    return np.concatenate([remaining[: k + 1], part, remaining[k + 1 :]])

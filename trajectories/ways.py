@@ -40,12 +40,15 @@ class Room:
 
 def straight_is_clear(room: Room, start: np.ndarray, end: np.ndarray) -> bool:
     """Return whether the straight move between two places (n,) is clear; eight places on it are checked first."""
-    count = max(int(np.ceil((np.abs(end - start) / room.spacing).sum())), 1)
+    steps = np.abs(end - start) / room.spacing
+    count = max(int(np.ceil(steps.sum())), 1)
     share = np.arange(1, count) / count
     if not len(share):
         return True
-    for part in (share[len(share) // 16 :: max(len(share) // 8, 1)], share):
-        if not room.clear(start + part[:, None] * (end - start)).all():
+    coarse = share[len(share) // 16 :: max(len(share) // 8, 1)]
+    for part in (coarse, share):
+        places = start + part[:, None] * (end - start)
+        if not room.clear(places).all():
             return False
     return True
 
@@ -65,12 +68,14 @@ def way(room: Room, start: np.ndarray, goal: np.ndarray, seed: int = 0, most: in
     trees = [([start], [-1]), ([goal], [-1])]
     for number in range(most):
         if generator.random() < MIDDLE_SHARE:
-            aim = (start + goal) / 2 + generator.normal(size=len(start)) * room.unit
+            spread = generator.normal(size=len(start)) * room.unit
+            aim = (start + goal) / 2 + spread
         else:
             aim = generator.uniform(room.lower, room.upper)
         tree = trees[number % 2]
         opposite = trees[1 - number % 2]
-        leaf = _grown(room, tree, np.clip(aim, room.lower, room.upper))
+        place = np.clip(aim, room.lower, room.upper)
+        leaf = _grown(room, tree, place)
         if leaf is None:
             continue
         node = tree[0][leaf]
@@ -80,7 +85,8 @@ def way(room: Room, start: np.ndarray, goal: np.ndarray, seed: int = 0, most: in
                 branches = [_branch(*tree, leaf), _branch(*opposite, opposite_leaf)]
                 if number % 2:
                     branches.reverse()
-                return _shortened(room, np.array(branches[0][::-1] + branches[1][1:]), generator)
+                places = np.array(branches[0][::-1] + branches[1][1:])
+                return _shortened(room, places, generator)
             opposite_leaf = _grown(room, opposite, node)
     return None
 
@@ -120,15 +126,19 @@ def _shortened(room: Room, places: np.ndarray, generator: np.random.Generator) -
             places = np.concatenate([places[: i + 1], places[j:]])
             continue
         i, j = np.sort(generator.choice(len(places) - 1, 2, replace=False))
-        start = places[i] + generator.random() * (places[i + 1] - places[i])
-        end = places[j] + generator.random() * (places[j + 1] - places[j])
+        step = places[i + 1] - places[i]
+        start = places[i] + generator.random() * step
+        step = places[j + 1] - places[j]
+        end = places[j] + generator.random() * step
         if not straight_is_clear(room, start, end):
             continue
-        detour = _length(room, start, *places[i + 1 : j + 1], end)
+        between = places[i + 1 : j + 1]
+        detour = _length(room, start, *between, end)
         if _length(room, start, end) < MAX_SHORTENED * detour:
             places = np.concatenate([places[: i + 1], [start, end], places[j + 1 :]])
     return places
 
 
 def _length(room: Room, *places: np.ndarray) -> float:
-    return float((np.abs(np.diff(np.array(places), axis=0)) / room.unit).max(axis=1).sum())
+    steps = np.abs(np.diff(np.array(places), axis=0)) / room.unit
+    return float(steps.max(axis=1).sum())

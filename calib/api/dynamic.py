@@ -22,10 +22,12 @@ from calib.procedure.dynamic_stage import folder, identify, inputs, metrics
 from calib.procedure.excitation import coefficients
 from calib.procedure.robot_kinds import Mechanism, stage_of
 from calib.records import as_subclass, plain
+from calib.result_kinds import BY_NAME
 from calib.robot.calibrated import CalibratedChain
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
+    from calib.api.rendering import DataFrame
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
@@ -35,6 +37,7 @@ Recorded = str | Path | Recording
 class DynamicsModel(ChartedResult, Judged, identify.IdentificationOutcome):
     """Identified dynamics with covariance and verdict. ``print`` shows errors on other motion, friction and verdict."""
 
+    kind = BY_NAME["identification"]
     tab = (
         "robot verdict warnings validation estimate residuals torques torque_sigma predictions plot save to_dict "
         "to_dataframe"

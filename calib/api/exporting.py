@@ -5,7 +5,6 @@ Validation compares a result with measurements that it was not estimated from.
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import overload
 
@@ -13,14 +12,13 @@ from calib.api.dynamic import DynamicsModel, Recorded
 from calib.api.kinematic import GeometryFit, Measured, Several
 from calib.api.rendering import listed, optional, saved
 from calib.arguments import checked
-from calib.errors import CalibWarning, RobotError, UsageError, refused_as, require
+from calib.errors import CalibWarning, UsageError, require
 from calib.procedure.dynamic_stage import identify as arm_identify
-from calib.procedure.export import delivery, geometry
-from calib.procedure.export.identified import is_identified
 from calib.procedure.kinematic_stage import fit as arm_fit
 from calib.procedure.kinematic_stage import inputs as measured
-from calib.procedure.robot_kinds import MechanismResult, stage_of
-from calib.robot.library import resolve
+from calib.procedure.robot_kinds import MechanismResult
+from calib.results.registry import open_result
+from calib.results.result import ExportSettings
 
 
 @overload
@@ -92,35 +90,9 @@ def export(
     Raises:
         RobotError: where a file does not read back as the robot; it is not written.
     """
-    into = Path(into)
+    settings = ExportSettings(optional(urdf), prior, ros2, tuple(map(Path, moveit)), control, overwrite)
     with saved(result) as folder:
-        stage = stage_of(folder, "export")
-        if stage is not None:
-            require(not ros2, f"ros2 {ros2}: a package is written of serial arms only", UsageError)
-            return stage.run(folder, into, urdf=urdf, prior=prior)
-        source = optional(urdf)
-        if is_identified(folder):
-            order = delivery.Export(source, identified=folder, prior=prior)
-        else:
-            order = delivery.Export(source or _source_of(folder), folder)
-        if ros2:
-            remark = delivery.verdicts(folder).of("urdf", dynamics=True).remark
-            order = replace(order, remark=remark)
-            moveit_paths = [*map(Path, moveit)]
-            from calib.procedure.export.ros2_package import write_package
-
-            return write_package(order, ros2, into, moveit=moveit_paths, control=control, overwrite=overwrite)
-        delivery.check_into(order, into, folder)
-        lines = delivery.deliver(order, into)
-        verdict_lines = delivery.mark(into, delivery.verdicts(folder))
-    for line in verdict_lines:
+        exported = open_result(folder, "export").export(Path(into), settings)
+    for line in exported.verdicts:
         warnings.warn(line, CalibWarning, stacklevel=3)
-    return (*verdict_lines, *lines)
-
-
-def _source_of(folder: Path) -> Path:
-    """Return the path of the robot description that a fit was made from."""
-    source = geometry.read(folder).source
-    message = f"{folder} was fitted from {source}, which is missing: give the robot's URDF (argument urdf)"
-    with refused_as(UsageError, RobotError, message):
-        return resolve(source)
+    return (*exported.verdicts, *exported.remarks)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 import numpy as np
 
 from calib import files
-from calib.api.rendering import ChartedResult, DataFrame, Judged, Progress, data_frame, listed, optional
+from calib.api.rendering import ChartedResult, Judged, Progress, Unjudged, data_frame, listed, optional
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions, read_options
@@ -26,10 +26,12 @@ from calib.procedure.measuring import prediction
 from calib.procedure.measuring.run import write_run
 from calib.procedure.robot_kinds import Mechanism, stage_of
 from calib.records import as_subclass, plain, shaped
+from calib.result_kinds import BY_NAME
 from calib.robot.calibrated import CalibratedChain
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
+    from calib.api.rendering import DataFrame
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
@@ -37,9 +39,10 @@ Measured = str | Path | PoseMeasurements
 Several = Measured | Sequence[Measured | Sequence[Measured]]
 
 
-class PoseSelection(ChartedResult, selection.Chosen):
+class PoseSelection(ChartedResult, Unjudged, selection.Chosen):
     """Poses that determine a robot's geometry best. ``print`` shows index, bound and what random poses reach."""
 
+    kind = BY_NAME["selection"]
     tab = "q chain selection outlook run notes plot save save_run to_dict to_dataframe"
 
     @property
@@ -117,6 +120,7 @@ class PredictedPoses(NamedTuple):
 class GeometryFit(ChartedResult, Judged, fit.Outcome):
     """A fitted geometry with covariance and verdict. ``print`` shows the ladder, errors on unseen poses and verdict."""
 
+    kind = BY_NAME["fit"]
     tab = (
         "robot verdict warnings validation estimate residuals outliers predict position_sigma plot save to_dict "
         "to_dataframe"

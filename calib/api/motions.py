@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from calib.api.dynamic import DynamicsModel
-from calib.api.rendering import ChartedResult, Progress, optional, saved
+from calib.api.rendering import ChartedResult, Progress, Unjudged, optional, saved
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.pose_lists import Targets
@@ -20,6 +20,7 @@ from calib.procedure.excitation import design, folder, planning
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
 from calib.procedure.robot_kinds import Mechanism, MechanismResult, stage_of
 from calib.records import as_subclass
+from calib.result_kinds import BY_NAME
 from calib.robot.calibrated import CalibratedChain
 from calib.trajectories.setpoints import Setpoints
 
@@ -33,9 +34,10 @@ def _columns(track: Setpoints) -> Sampled:
     return track.times, track.q, track.v, track.a
 
 
-class ExcitationDesign(ChartedResult, design.Designed):
+class ExcitationDesign(ChartedResult, Unjudged, design.Designed):
     """A motion that excites a robot's dynamics, verified within limits. ``print`` shows condition numbers, margins."""
 
+    kind = BY_NAME["excitation"]
     tab = "period condition goals proof outlook predicted front notes sampled plot save to_dict"
 
     def sampled(self, rate: float | None = None) -> Sampled:
@@ -71,9 +73,10 @@ class ExcitationDesign(ChartedResult, design.Designed):
         return "\n".join(folder.design_lines(self))
 
 
-class MotionPlan(ChartedResult, planning.Planned):
+class MotionPlan(ChartedResult, Unjudged, planning.Planned):
     """The fastest motion through waypoints, within speeds and torques. ``print`` shows duration and margins."""
 
+    kind = BY_NAME["plan"]
     tab = "duration track margins deviation sigma notes sampled plot save to_dict"
 
     @property

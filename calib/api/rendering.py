@@ -15,13 +15,17 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeAlias, overload
 
 from calib.errors import UsageError, one_of, refused_as
+from calib.procedure.findings import NOT_JUDGED, Verdict
+from calib.result_kinds import ResultKind
 from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from calib.data.csv_table import Table
     from calib.procedure.report.charts import Chart
-    from calib.procedure.report.page import Section
+    from calib.procedure.report.page import Picture, Section
+    from calib.results.scene import Scene
 
 Progress = Callable[[str], None]
 DataFrame: TypeAlias = Any
@@ -83,8 +87,59 @@ class Shown:
         return {"text/plain": str(self)}
 
 
-class ChartedResult(Shown, ABC):
+class Kept(Shown, ABC):
+    """A result that is written to a folder, and a `calib.Result`: what its folder holds it reads there.
+
+    Attributes:
+        kind: one of `calib.result_kinds.KINDS`.
+    """
+
+    kind: ClassVar[ResultKind]
+
+    @abstractmethod
+    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+        """Write the result's folder."""
+
+    def figures(self) -> Mapping[str, Picture]:
+        """Return the figures by name, as PNG."""
+        return {}
+
+    def tables(self) -> Mapping[str, Table]:
+        """Return the tables by name, as the files that `save` writes hold them."""
+        from calib.results.registry import open_result
+
+        with saved(self) as folder:
+            return open_result(folder).tables()
+
+    def scene(self, robot: str | None = None) -> Scene:
+        """Return what the viewer draws: robot, poses, motions, torques.
+
+        Args:
+            robot: the robot to draw; None for the result's.
+        """
+        from calib.results.registry import open_result
+
+        with saved(self) as folder:
+            return open_result(folder, "view").scene(robot)
+
+
+class Unjudged(Kept):
+    """A result that keeps what was asked of it, and has no verdict."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """Not judged."""
+        return Verdict(NOT_JUDGED, f"{self.kind.noun} has no verdict")
+
+
+class ChartedResult(Kept):
     """A result with figures."""
+
+    def figures(self) -> Mapping[str, Picture]:
+        """Return the figures by name, as PNG."""
+        from calib.procedure.report.charts import picture
+
+        return {name: picture(chart, "") for name, chart in self.charts().items()}
 
     @abstractmethod
     def charts(self) -> Mapping[str, Chart]:
@@ -106,7 +161,7 @@ class ChartedResult(Shown, ABC):
         return charts.figure(charts_by_name[name])
 
 
-class Judged(Shown, ABC):
+class Judged(Kept):
     """A result shown as a section of a report: on a console, by ``print``, and as a page in a notebook."""
 
     @abstractmethod

@@ -108,8 +108,7 @@ def identify_dynamics(
         out: folder for the identified model and its report
         validate: recording of other motion; may be repeated
         method: wls or another one of calib formats identify-options
-        friction: auto, standard, or one step: coupling, load, presliding, stribeck, asymmetric, root, cubic, ripple,
-            cable
+        friction: auto, standard, or one step of the ladder; calib formats identify-options names them
         options: TOML: drives, payloads, gains, filters, identification
         excitation: folder of calib excite: its prediction is compared with the result; its motion is the reference of
             recordings that have none (methods with a [loop])

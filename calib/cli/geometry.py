@@ -182,8 +182,8 @@ def export(
     from calib.errors import UsageError, command_line, require
     from calib.files import results
     from calib.procedure.export import delivery, geometry
-    from calib.procedure.export.identified import is_identified
     from calib.procedure.robot_kinds import stage_of
+    from calib.results.registry import open_result
 
     stage_of(folder, "export" if into else "export to single files")
     if into or ros2:
@@ -205,7 +205,7 @@ def export(
                 control=ros2_control,
                 overwrite=overwrite,
             )
-        say_written(lines, target / ros2, delivery.verdicts(folder).level)
+        say_written(lines, target / ros2, open_result(folder).verdicts.level)
         return
     message = "nothing to write: give --urdf SOURCE.urdf --out FILE.urdf, --ur-kinematics, --offsets, --ros2 or --into"
     require((urdf is None) == (out is None) and (urdf or ur_kinematics or offsets), message, UsageError)
@@ -220,7 +220,8 @@ def export(
         if path:
             targets.append((path, suffixes))
             paths[form] = path
-    verdict = delivery.verdicts(folder).of("corrections" if for_corrections else "urdf", dynamics=True)
+    result = open_result(folder, "export")
+    verdict = result.verdicts.of("corrections" if for_corrections else "urdf", dynamics=True)
     fitted_robot = geometry.read(folder)
     with results(targets, [urdf, *geometry.results(folder)], overwrite):
         lines = delivery.deliver_single(delivery.Export(urdf, folder, remark=verdict.remark), paths)
@@ -229,7 +230,7 @@ def export(
         say(f"note: these files do not include the corrections (joint_corrections.csv in {folder})")
     if verdict.level:
         say(str(verdict))
-    if urdf and is_identified(folder):
+    if urdf and result.identification is not None:
         full_export = command_line("export", folder, "--urdf", urdf, "--into", "FOLDER")
         masses = f"the calibrated geometry with the masses of {urdf}"
         say(f"note: {out} has {masses}; {full_export} writes the identified ones")

@@ -145,8 +145,9 @@ def status(folder: Folder) -> None:
     Example: calib status cell
     """
     from calib.procedure.session import commands
+    from calib.results.registry import open_result
 
-    say(*commands.status_lines(folder), result=True)
+    say(*open_result(folder, "session").status(), result=True)
     say(*commands.noted(folder))
 
 

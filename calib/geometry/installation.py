@@ -69,7 +69,7 @@ class Installation:
         stations: (S, 4, 4) poses of the arm's base in each instrument's frame.
         tools: (T, 4, 4) poses of each target in the tip's frame.
         station_names, tool_names: S and T strings.
-        deflection: joint corrections as functions of q (stiffness, coupling, harmonics), to be fitted.
+        deflection: joint corrections as functions of q (effects of the ladder), to be fitted.
         known: deflections of an earlier fit, kept fixed.
         optics: parameters of cameras and boards for images, with the interface of `NoOptics`.
     """

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from calib.data.poses.measurements import PoseMeasurements, Poses, Positions
+from calib.data.poses.measurements import PoseMeasurements, Poses, Positions, take
 from calib.errors import counted
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, predict, prepare, rows_of
@@ -264,6 +264,23 @@ def _variation(points: np.ndarray, directions: np.ndarray) -> float:
     return max(float(np.linalg.norm(first - second)) for first, second in combinations(centres, 2))
 
 
+def without_copies(block: PoseMeasurements) -> tuple[PoseMeasurements, list[str]]:
+    """Return a block without rows whose joint values and readings are those of an earlier row, and notes on them.
+
+    A row that was copied tells nothing new: counted again it makes σ smaller, and held-out rows stand among the fitted.
+    """
+    marks = set[bytes]()
+    copied = np.zeros(len(block), dtype=bool)
+    for row, mark in enumerate(_marks(block)):
+        copied[row] = mark in marks
+        marks.add(mark)
+    if not copied.any():
+        return block, []
+    numbers = _row_numbers(block, copied)
+    note = f"{Path(block.file).name}: {_rows(numbers)} identical to another row of the file: not counted again"
+    return take(block, np.flatnonzero(~copied)), [note]
+
+
 def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, PoseMeasurements]) -> tuple[set[str], list[str]]:
     """Return the names of validation files that mostly repeat rows of the fit, and notes on repeated rows.
 
@@ -278,19 +295,10 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, PoseMeasureme
     fitted = set[bytes]()
     for block in fit:
         marks = _marks(block)
-        in_file = set[bytes]()
-        repeats_row, repeats_file = [], []
-        for mark in marks:
-            repeats_row.append(mark in in_file)
-            repeats_file.append(mark in fitted)
-            in_file.add(mark)
-        fitted |= in_file
-        name = Path(block.file).name
-        within = _row_numbers(block, repeats_row)
-        if within:
-            notes.append(f"{name}: {_rows(within)} identical to another row of the file: each counts twice")
-        before = _row_numbers(block, repeats_file)
+        before = _row_numbers(block, [mark in fitted for mark in marks])
+        fitted |= set(marks)
         if before:
+            name = Path(block.file).name
             notes.append(f"{name}: {_rows(before)} identical to rows of another fitted file. Is the file given twice?")
     proofless = set()
     for name, block in unseen.items():

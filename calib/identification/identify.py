@@ -14,7 +14,7 @@ from calib.dynamics.bodies import standard_parameters
 from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.regressor_model import RegressorModel, States
-from calib.dynamics.torque_rows import POWER
+from calib.dynamics.torque_rows import POWER, TorqueRows
 from calib.errors import MeasurementError, UsageError, refuse_data, require
 from calib.estimation.essential import Elimination, Rule, eliminate
 from calib.estimation.triangles import condition_numbers
@@ -30,10 +30,10 @@ from calib.identification.registry import METHODS, method_named
 from calib.identification.rows import Case, ObservationRows, observe, observe_terms, pool, triangulate, with_blocks
 from calib.identification.settings import IdentificationSettings, make_model, require_usable
 from calib.identification.standstill import (
+    BREAKAWAY_ROUNDS,
     CLEARLY_LESS,
-    LESS,
     left_out_error,
-    with_slowness,
+    with_breakaway,
     with_standstills,
     with_weights,
 )
@@ -48,6 +48,8 @@ MAX_RATE_RATIO = 1.02
 
 
 Progress = Callable[[str], None]
+# rows of all recordings, their prior, and the fit that weighs them
+_Fitted = tuple[list[ObservationRows], Prior | None, FirstFit]
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,24 +184,21 @@ def identify_model(
     rows_as_moving, rows = _observed(model, base, cases, decimator, settings, method)
 
     say("first fit")
-    robot, source = (shape, "sizes") if cad is None else (cad, "cad")
+    if cad is None:
+        robot, source = shape, "sizes"
+    else:
+        robot, source = cad, "cad"
     find = partial(find_prior, model, base, robot=robot, source=source, noise=noise, effort=effort)
     takes_prior = _takes_prior(method, model, settings, source)
-    prior = find(rows) if takes_prior else None
-    first = first_fit(rows, noise) if prior is None else prior.first
+    rows, prior, first = _first_fit(rows, find, takes_prior, noise)
     rows = with_weights(rows, first.rest_weights)
     marks_standstills = isinstance(method, LeastSquares) and isinstance(model, IdentificationModel)
     if any(part.standing.any() for part in rows):
-        prior_as_moving = find(rows_as_moving) if takes_prior else None
-        first_as_moving = first_fit(rows_as_moving, noise) if prior_as_moving is None else prior_as_moving.first
-        prior_rows = None if prior is None else prior.rows
-        prior_rows_as_moving = None if prior_as_moving is None else prior_as_moving.rows
-        error = left_out_error(rows, rows, first.std, first.inflation, prior_rows, settings.apart)
-        error_as_moving = left_out_error(
-            rows_as_moving, rows, first_as_moving.std, first_as_moving.inflation, prior_rows_as_moving, settings.apart
-        )
+        as_moving = _first_fit(rows_as_moving, find, takes_prior, noise)
+        error = _left_out_error((rows, prior, first), rows, settings)
+        error_as_moving = _left_out_error(as_moving, rows, settings)
         if error_as_moving < CLEARLY_LESS**2 * error:
-            rows, prior, first = rows_as_moving, prior_as_moving, first_as_moving
+            rows, prior, first = as_moving
             marks_standstills = False
     if prior is not None:
         prior = tempered_prior(find, prior, rows, regimes(rows, cases, decimator))
@@ -212,33 +211,25 @@ def identify_model(
         columns = observe_terms(friction.terms, case, decimator, load, model.torque_rows)
         richer_rows.append(part.extend(friction.terms, columns))
     groups = np.array(friction.groups, dtype=int)
+    column_groups = np.concatenate([np.full(base.b, -1), groups])
     if prior is not None and marks_standstills:
-        # richer friction explains slow motion, too: its residuals count
-        data = pool(triangulate(richer_rows), richer_rows[0].target.shape[1])
-        inflation = prior.tempering * first.inflation
-        column_groups = np.concatenate([np.full(base.b, -1), groups])
-        prior_rows = prior.widened(len(groups))
-        values, _ = estimate(data, first.std, inflation, column_groups, prior_rows)
-        weighed = with_slowness(richer_rows, cases, decimator, model.torque_rows, values)
-        error = left_out_error(richer_rows, richer_rows, first.std, inflation, prior_rows, settings.apart)
-        error_weighed = left_out_error(weighed, richer_rows, first.std, inflation, prior_rows, settings.apart)
-        if error_weighed < LESS**2 * error:
-            richer_rows = weighed
-    slow_rows_weighed = any((part.slowness < 1.0).any() for part in richer_rows)
-    if prior is not None and (friction.terms or slow_rows_weighed):
+        richer_rows = _weighed_after_standstills(
+            richer_rows, cases, decimator, model.torque_rows, first, prior, column_groups
+        )
+    breakaway = any((part.breakaway < 1.0).any() for part in richer_rows)
+    if prior is not None and (friction.terms or breakaway):
         say("sizes beside richer friction")
         prior = find(richer_rows, groups=groups, start=prior, tempering=prior.tempering)
         richer_rows = with_weights(richer_rows, prior.first.rest_weights)
 
-    base_terms = [None if column < model.inertial else model.columns[column - model.inertial] for column in base.kept]
     problem = IdentificationProblem(
         model=model,
         base=base,
         cases=cases,
         decimator=decimator,
         rows=tuple(richer_rows),
-        terms=(*base_terms, *friction.terms),
-        groups=np.concatenate([np.full(base.b, -1), friction.groups]),
+        terms=(*_terms_of(model, base), *friction.terms),
+        groups=column_groups,
         noise=noise,
         prior=prior,
         loop=settings.loop,
@@ -246,6 +237,66 @@ def identify_model(
         constraints=settings.constraints,
     )
     return _identified(problem, method, friction, settings, say)
+
+
+def _first_fit(
+    rows: list[ObservationRows], find: Callable[..., Prior], takes_prior: bool, noise: np.ndarray | None
+) -> _Fitted:
+    """Return the rows with their prior (None where the method takes none) and their first fit."""
+    if takes_prior:
+        prior = find(rows)
+        return rows, prior, prior.first
+    return rows, None, first_fit(rows, noise)
+
+
+def _left_out_error(
+    fitted: _Fitted, reference_rows: Sequence[ObservationRows], settings: IdentificationSettings
+) -> float:
+    """Return the error of a first fit on the reference rows of time blocks left out of it."""
+    rows, prior, first = fitted
+    prior_rows = None
+    if prior is not None:
+        prior_rows = prior.rows
+    return left_out_error(rows, reference_rows, first.std, first.inflation, prior_rows, settings.apart)
+
+
+def _weighed_after_standstills(
+    rows: list[ObservationRows],
+    cases: Sequence[Case],
+    decimator: Decimator,
+    torque_rows: TorqueRows,
+    first: FirstFit,
+    prior: Prior,
+    column_groups: np.ndarray,
+) -> list[ObservationRows]:
+    """Return the rows weighed where friction at rest still fades after a standstill, as the residuals ask for.
+
+    Richer friction explains slow motion, too: its residuals count.
+
+    Args:
+        rows: of all recordings, richer friction included.
+        first: the fit that weighs the joints' rows.
+        prior: of the base parameters.
+        column_groups: ridge group of each column; -1 for base parameters.
+    """
+    inflation = prior.tempering * first.inflation
+    prior_rows = prior.widened(int((column_groups >= 0).sum()))
+    for _ in range(BREAKAWAY_ROUNDS):
+        data = pool(triangulate(rows), rows[0].target.shape[1])
+        values, _ = estimate(data, first.std, inflation, column_groups, prior_rows)
+        rows = with_breakaway(rows, cases, decimator, torque_rows, values)
+    return rows
+
+
+def _terms_of(model: RegressorModel, base: Base) -> list[DriveTerm | None]:
+    """Return the drive term of each base parameter; None for parameters of bodies."""
+    terms: list[DriveTerm | None] = []
+    for column in base.kept:
+        if column < model.inertial:
+            terms.append(None)
+        else:
+            terms.append(model.columns[column - model.inertial])
+    return terms
 
 
 def _observed(

@@ -2,8 +2,8 @@
 
 TOML; every key is optional, and a key that is none of these is refused. SI units; joints are counted from 1::
 
-    friction = "auto"                # auto, standard, or a rung: coupling, load, presliding, stribeck, asymmetric,
-                                     # root, cubic, ripple; with rows = "both" also cable
+    friction = "auto"                # auto, standard, or one rung of the ladder; all names: below; auto tries cable
+                                     # where rows = "both"
     method = "wls"                   # ols, wls, irls, tls, gtls, ml, adaline, hopfield, set-membership; ekf, ukf, cdkf
                                      # and their square-root forms srekf …; iv, didim (called CLIE elsewhere), cloe,
                                      # clie (the survey's) simulate the closed loop, see [loop]; pc-ols, pc-wls,

@@ -166,7 +166,7 @@ class ObservationRows:
         rate: sampling rate [Hz].
         standing: (M, rows) share of its standstill that each row is; 0 in motion.
         swing: (M, rows) range of the torque in that standstill [N m or N]; 0 in motion.
-        slowness: (M, rows) factor of each row in motion: less than 1 where its joint is slow and the model errs more.
+        breakaway: (M, rows) factor of each row in motion: less than 1 where friction at rest still fades.
         rest: weights of standstills.
         coulomb: (rows, p) columns that are Coulomb friction of a torque row.
     """
@@ -180,7 +180,7 @@ class ObservationRows:
     rate: float
     standing: np.ndarray
     swing: np.ndarray
-    slowness: np.ndarray
+    breakaway: np.ndarray
     rest: RestWeights
     coulomb: np.ndarray
 
@@ -188,7 +188,7 @@ class ObservationRows:
     def weight(self) -> np.ndarray:
         """Factor (M, rows) that rows are multiplied by in estimates: 1 in motion, less at rest, 0 where not used."""
         at_rest = np.sqrt(self._frictions * self.rest.worth)
-        return np.where(self.standing > 0.0, at_rest, self.slowness) * self.present
+        return np.where(self.standing > 0.0, at_rest, self.breakaway) * self.present
 
     @property
     def counted(self) -> np.ndarray:
@@ -213,7 +213,7 @@ class ObservationRows:
             present=self.present & filled,
             standing=np.repeat(self.standing, count, axis=1),
             swing=np.repeat(self.swing, count, axis=1),
-            slowness=np.repeat(self.slowness, count, axis=1),
+            breakaway=np.repeat(self.breakaway, count, axis=1),
             rest=_no_rest(count),
             coulomb=np.repeat(self.coulomb, count, axis=0),
         )
@@ -292,7 +292,7 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
         rate=motion.rate / decimator.factor,
         standing=np.zeros(target.shape),
         swing=np.zeros(target.shape),
-        slowness=np.ones(target.shape),
+        breakaway=np.ones(target.shape),
         rest=_no_rest(model.rows),
         coulomb=np.zeros((model.rows, len(columns)), dtype=bool),
     )
@@ -395,7 +395,7 @@ def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
             group = block[present] * row_count + row
             matrix = rows.matrix[present, row]
             target = rows.target[present, row]
-            if rows.standing[:, row].any() or (rows.slowness[:, row] < 1.0).any():
+            if rows.standing[:, row].any() or (rows.breakaway[:, row] < 1.0).any():
                 weight = rows.weight[present, row]
                 matrix = matrix * weight[:, None]
                 target = target * weight

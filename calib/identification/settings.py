@@ -63,7 +63,7 @@ class Choices:
         passive: drive terms of a parallel robot's passive joints, one text for all.
         identical_legs: whether a parallel robot's legs have the same inertial parameters.
         v0: smoothing of the Coulomb sign [rad/s or m/s], one per joint, or one for all.
-        friction: ``auto``, ``standard`` or a step (`calib.identification.friction.friction_ladder`).
+        friction: model of the drives' friction; auto selects steps of the ladder by the errors on held-out time.
         method: name of the method, see `calib.identification.methods.least_squares`.
         weights: source of the joints' weights in WLS, one of `WEIGHTS`: residuals, or variance over repeats.
         essential: rule to stop eliminating parameters, one of `RULES`.

@@ -15,6 +15,14 @@ evenly, so that they still say how the torque changes with what other joints do.
 friction spans, friction has taken another value: a standstill whose torque ranges over r counts as 1 + r / reach
 values, reach = 2 √3 √(f² + τ s²), the width of an even distribution of that variance.
 
+After it friction is not at once that of motion: gears unwind, and contacts give way. What it was at rest fades over a
+travel δ, so that a row at the travel d since the last standstill has the variance
+
+    s² + f² exp(-2 d / δ),
+
+δ being one for the robot, as likely as possible by the residuals of a fit among `TRAVELS` (0: it fades at once). On
+the KR300 it is some 5 to 20 mrad, on harmonic drives 1 mrad.
+
 Reversals pass through zero speed and stay rows as others: shorter than `MIN_STANDSTILL`, or, of slow motion, as often
 at one small speed as at another, where a joint that stands is slower than `MAX_MEDIAN` for half of the time. Torques of
 sensors behind the gear have no such friction.
@@ -41,10 +49,10 @@ from calib.records import frozen
 
 MIN_STANDSTILL = 0.05  # [s] that a joint stands; shorter ones are reversals (our choice)
 MAX_MEDIAN = 0.25  # of the width of Coulomb's sign; of a speed that passes evenly through zero it is 0.5 (our choice)
-SLOW = 0.1  # of a joint's peak speed, below which its rows in motion have a variance of their own (our choice)
-MIN_SLOW = 20  # slow rows of a joint, below which their variance is not known (our choice)
 CLEARLY_LESS = 0.85  # of the error in motion on left-out time, for which standing rows count as any others (our choice)
-LESS = 0.98  # of that error, for which slow rows are weighed by their own variance (our choice)
+TRAVELS = (0.0, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05)  # over which friction at rest may fade [rad or m] (our choice)
+BREAKAWAY_ROUNDS = 3  # of a fit and the travel that its residuals ask for
+VARIANCE_ROUNDS = 20
 MIN_MOVING = 10  # rows in motion, below which a joint's standing rows count as any others: no friction is identified
 
 
@@ -214,9 +222,9 @@ def divided(all_rows: Sequence[ObservationRows]) -> DividedRows:
             share = part.standing[:, row]
             rests = part.present[:, row] & (share > 0.0)
             moves = part.present[:, row] & (share == 0.0)
-            slowness = part.slowness[moves, row]
-            in_motion = part.matrix[moves, row] * slowness[:, None]
-            moving = absorb(moving, in_motion, part.target[moves, row] * slowness, row)
+            weight = part.breakaway[moves, row]
+            in_motion = part.matrix[moves, row] * weight[:, None]
+            moving = absorb(moving, in_motion, part.target[moves, row] * weight, row)
             matrix, target = part.matrix[rests, row], part.target[rests, row]
             ranges = share[rests] * part.swing[rests, row]
             root, wider = np.sqrt(share[rests]), np.sqrt(ranges)
@@ -236,40 +244,80 @@ def with_weights(all_rows: Sequence[ObservationRows], weights: RestWeights) -> l
     return [replace(part, rest=weights) for part in all_rows]
 
 
-def with_slowness(
+def with_breakaway(
     all_rows: Sequence[ObservationRows],
     cases: Sequence[Case],
     decimator: Decimator,
     torque_rows: TorqueRows,
     values: np.ndarray,
 ) -> list[ObservationRows]:
-    """Return rows in which slow ones count by the variance of their own residuals, where that is the larger one.
-
-    Near a reversal friction is on its way from one sign to the other, gears wind up, and the model errs more than in
-    fast motion.
+    """Return rows after standstills weighed by how far friction is on its way to the value of motion, see the module.
 
     Args:
-        values: (p,) of a fit, whose residuals are taken.
+        values: (p,) of a fit, whose residuals say over which travel that is.
     """
-    peak = np.max([np.abs(case.motion.v).max(axis=0) for case in cases], axis=0)
-    slow_masks = []
-    squares, counts = np.zeros((2, all_rows[0].target.shape[1])), np.zeros((2, all_rows[0].target.shape[1]))
-    for part, case in zip(all_rows, cases):
-        slow = torque_rows.of_joints(np.abs(case.motion.v) < SLOW * peak)
-        slow = thinned(slow, case.motion.segment, decimator)
-        moves = part.present & (part.standing == 0.0)
-        residual = part.target - part.matrix @ values
-        for place, mask in enumerate((moves & ~slow, moves & slow)):
-            squares[place] += np.sum(residual**2 * mask, axis=0)
-            counts[place] += mask.sum(axis=0)
-        slow_masks.append(slow)
-    fast, slow = squares / np.maximum(counts, 1.0)
-    differ = (counts.min(axis=0) >= MIN_SLOW) & (slow > fast)
-    factor = np.where(differ, np.sqrt(fast / np.where(differ, slow, 1.0)), 1.0)
-    return [
-        replace(part, slowness=frozen(np.where(slow_mask, factor, 1.0)))
-        for part, slow_mask in zip(all_rows, slow_masks)
-    ]
+    parts = divided(all_rows)
+    spread = parts.standing.residual_squares(values) / np.maximum(parts.standstills, 1.0)
+    travels = [_travel_since_standstill(part, case, decimator, torque_rows) for part, case in zip(all_rows, cases)]
+    squares, all_travels = [], []
+    for row in range(len(spread)):
+        moves = [part.present[:, row] & (part.standing[:, row] == 0.0) for part in all_rows]
+        residuals = [part.target[mask, row] - part.matrix[mask, row] @ values for part, mask in zip(all_rows, moves)]
+        squares.append(np.concatenate(residuals) ** 2)
+        all_travels.append(np.concatenate([travel[mask, row] for travel, mask in zip(travels, moves)]))
+
+    best_cost, best_reach, best_variance = np.inf, 0.0, np.ones(len(spread))
+    for reach in TRAVELS:
+        cost, variance = 0.0, np.ones(len(spread))
+        for row, (square, travel) in enumerate(zip(squares, all_travels)):
+            if len(square) == 0:
+                continue
+            friction = spread[row] * _remembered(travel, reach)
+            variance[row] = _variance_in_motion(square, friction)
+            total = variance[row] + friction
+            cost += float(np.sum(np.log(total) + square / total))
+        if cost < best_cost:
+            best_cost, best_reach, best_variance = cost, reach, variance
+
+    result = []
+    for part, travel in zip(all_rows, travels):
+        ratio = spread * _remembered(travel, best_reach) / best_variance
+        result.append(replace(part, breakaway=frozen(1.0 / np.sqrt(1.0 + ratio))))
+    return result
+
+
+def _travel_since_standstill(
+    part: ObservationRows, case: Case, decimator: Decimator, torque_rows: TorqueRows
+) -> np.ndarray:
+    """Return how far each row's joint has come since its last standstill (M, rows) [rad or m]; infinite before any."""
+    index = kept(case.motion.segment, decimator)
+    segment = case.motion.segment[index]
+    position = torque_rows.of_joints(case.motion.q)[index]
+    result = np.full(part.target.shape, np.inf)
+    for start, stop in segments(segment):
+        for row in range(result.shape[1]):
+            runs = _runs(part.standing[start:stop, row] > 0.0)
+            starts = [start + first for first, _ in runs[1:]]
+            for (_, end), following in zip(runs, [*starts, stop]):
+                moving = slice(start + end, following)
+                away = np.abs(position[moving, row] - position[start + end - 1, row])
+                result[moving, row] = np.maximum.accumulate(away)
+    return result
+
+
+def _remembered(travel: np.ndarray, reach: float) -> np.ndarray:
+    """Return the share of the variance of friction at rest that is left after a travel."""
+    if reach == 0.0:
+        return np.zeros(travel.shape)
+    return np.exp(-2.0 * travel / reach)
+
+
+def _variance_in_motion(squares: np.ndarray, friction: np.ndarray) -> float:
+    """Return the most probable variance of residuals with these squares (M,), to which that of friction (M,) adds."""
+    variance = max(float(squares.mean()), 1e-300)
+    for _ in range(VARIANCE_ROUNDS):
+        variance = max(float(np.mean(squares * variance / (variance + friction))), 1e-300)
+    return variance
 
 
 def left_out_error(

@@ -44,10 +44,12 @@ from calib.parallel.robots import ParallelMechanism, refuse_unread
 from calib.procedure.findings import Verdict
 from calib.procedure.kinematic_stage.folder import RESIDUALS
 from calib.procedure.kinematic_stage.settings import FitSettings
+from calib.result_kinds import BY_NAME
 from calib.robot import calibrated
 from calib.robot.calibrated import ROBOT
 
 if TYPE_CHECKING:
+    from calib.api.rendering import DataFrame
     from calib.procedure.report.charts import Chart
     from calib.procedure.report.page import Section
 
@@ -75,6 +77,8 @@ class ParallelFit(ChartedResult, Judged):
         unseen_rows: the unseen rows themselves, by name, but those of a cross-validation.
         settings: what was asked for.
     """
+
+    kind = BY_NAME["fit"]
 
     nominal: ParallelMechanism
     files: tuple[Path, ...]

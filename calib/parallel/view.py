@@ -22,7 +22,7 @@ DIMENSIONS.update(dict.fromkeys(COORDINATES[3:], "angle"))
 
 @dataclass(frozen=True, eq=False)
 class MechanismPicture:
-    """A parallel robot to draw, a `calib.apps.viewer.scene.Drawn`; q (m, n) are readings of its actuated joints."""
+    """A parallel robot to draw, a `calib.results.scene.Drawn`; q (m, n) are readings of its actuated joints."""
 
     mechanism: ClosedRobot
 
@@ -70,7 +70,7 @@ class MechanismPicture:
         return rows.titles(self.joint_names), units
 
     def measured(self, path: Path) -> tuple[np.ndarray, ...]:
-        """Return what a fit's folder holds of its poses, in the order of `calib.apps.viewer.scene.Measured`.
+        """Return what a fit's folder holds of its poses, in the order of `calib.results.scene.Measured`.
 
         Readings q (m, n); positions (m, 3) of the platform seen, by the nominal and by the calibrated robot [m];
         whether each was unseen (m,); rotation vectors from the calibrated to the measured orientation (m, 3) [rad], NaN

@@ -30,7 +30,7 @@ def _entry(value: object) -> object:
     return line
 
 
-StatedEntry = Annotated[Text, Checked(_entry)]
+StatedEntry = Annotated[Text, Checked(_entry, {"type": ["string", "number"]})]
 
 
 @strict

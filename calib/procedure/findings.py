@@ -246,11 +246,33 @@ def explain(code: str) -> str:
             return meaning
         hint = suggestion(code, [*catalogue(), *glossary()])
         raise UsageError(f"no finding or term is called '{code}'{hint}; `calib explain` lists all")
-    parts = [entry.says, f"level: {levels(entry)}", entry.means, entry.advice]
+    parts = [in_words(entry.says), f"level: {levels(entry)}", entry.means, in_words(entry.advice)]
     if entry.accept:
         parts.append(f'accept = ["{entry.accept}"] in the options file lets the verdict pass')
     lines = [f"  {part}" for part in parts if part]
     return "\n".join([code, *lines])
+
+
+def in_words(template: str) -> str:
+    """Return a template to read: names of values in capitals with their units, parts that may be left out in brackets.
+
+    ``{rms:.3g mm} remain<, {rival} too>`` is ``RMS mm remain[, RIVAL too]``.
+    """
+    words = []
+    for text, name, format_spec, _ in Formatter().parse(template):
+        words.append(text.replace("<", "[").replace(">", "]"))
+        if name:
+            _, _, unit = (format_spec or "").partition(" ")
+            value = name.upper().replace("_", " ")
+            words.append(_with_unit(value, unit))
+    return "".join(words)
+
+
+def _with_unit(text: str, unit: str) -> str:
+    """Return a printed value followed by its unit; a degree sign stands without a space."""
+    if unit in ("", "°"):
+        return text + unit
+    return f"{text} {unit}"
 
 
 def _filled(template: str, values: Mapping[str, object]) -> str:
@@ -274,7 +296,4 @@ class _Printer(Formatter):
             return listing(value)
         if unit:
             value = value * UNITS.get(unit, 1.0)
-        text = format(value, number)
-        if unit in ("", "°"):
-            return text + unit
-        return f"{text} {unit}"
+        return _with_unit(format(value, number), unit)

@@ -72,12 +72,14 @@ SCHEMAS: Mapping[str, tuple[str, str]] = {
     "options": ("calib.data.poses.fit_options", "FitOptions"),
     "identify-options": ("calib.identification.identify_options", "IdentifySettings"),
     "constraints": ("calib.procedure.measuring.constraints_file", "ConstraintsFile"),
+    "mdh": ("calib.robot.mdh", "MdhFile"),
+    "robot": ("calib.robot.description", "ElementsFile"),
     "limits": ("calib.procedure.excitation.limits", "LimitsFile"),
     "session": ("calib.procedure.session.settings", "SessionSettings"),
     **{topic: (modules.split()[0], kind) for topic, (_, modules, kind) in merged(FORMATS).items() if kind},
 }
 # types of a JSON schema, and bounds of its numbers, in words
-_KINDS = {"string": "text", "integer": "whole number", "boolean": "true or false", "object": "table"}
+_KINDS = {"string": "text", "integer": "whole number", "boolean": "true or false", "object": "table", "array": "list"}
 _BOUNDS = {"exclusiveMinimum": "above", "minimum": "from", "maximum": "to"}
 
 

@@ -34,22 +34,20 @@ Implausible values of a description are reported: invalid limits, impossible bod
 """
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 
 from calib import files
-from calib.config_types import ParsedTable
+from calib.config import parse, strict
+from calib.config_types import Name, Numeric, OneOf, ParsedTable, Whole
 from calib.errors import RobotError, listing, refuse_robot, require
-from calib.records import FieldValues
 from calib.robot import mdh, tables
-from calib.robot.chain import Chain, Element, Joint
+from calib.robot.chain import AXES, Chain, Element, Joint
 
-EXTRA = ("station", "tool", "camera", "board", "deflection", "truth", "provenance")
-_TOP = ("name", "base", "tip", "gravity", "floor", "source", "joint", "element", "tail")
-_JOINT = ("name", "kind", *tables.LIMITS, "link", "inertia")
-_ELEMENT = tuple(field.name for field in fields(Element))
+EXTRA = tables.EXTRA
 
 # Largest plausible limit [rad]: a continuous wrist may be given two turns (our choice).
 MAX_TURN = 4.0 * np.pi + 0.01
@@ -59,6 +57,71 @@ MAX_DENSITY = 1000.0
 ROUNDING = 1e-6
 # Share by which a moment may exceed the sum of the others: rounded sets do by up to 0.7 (our choice).
 MAX_EXCESS = 1.0
+
+
+@strict
+@dataclass(frozen=True)
+class JointTable:
+    """Table ``[[joint]]`` of a robot file of elements.
+
+    Attributes:
+        name: of the joint.
+        kind: of the joint.
+        lower, upper: limits [rad or m].
+        velocity: limit [rad/s or m/s].
+        effort: limit [N m or N].
+        link: its link in the URDF.
+        inertia: XX XY XZ YY YZ ZZ MX MY MZ M about the joint's frame [kg m², kg m, kg].
+    """
+
+    name: Name
+    kind: Annotated[str, OneOf(("revolute", "prismatic"))] = "revolute"
+    lower: tables.Unlimited | None = None
+    upper: tables.Unlimited | None = None
+    velocity: tables.Unlimited | None = None
+    effort: tables.Unlimited | None = None
+    link: Name | None = None
+    inertia: tables.Inertia | None = None
+
+
+@strict
+@dataclass(frozen=True)
+class ElementTable:
+    """Table ``[[element]]``: placement · exp(sign · axis · (value + ratio · q_joint)).
+
+    Attributes:
+        name: of the element.
+        axis: along or about which it moves.
+        value: constant part [m or rad].
+        owner: number of the joint it places, counted from 0.
+        joint: number of the joint that moves it; left out where it is constant.
+        ratio: of its motion to the joint's.
+        sign: 1 or -1.
+        placement: of its axis.
+    """
+
+    name: Name
+    axis: Annotated[str, OneOf(AXES)]
+    value: Numeric = 0.0
+    owner: Annotated[int, Whole(0)] = 0
+    joint: Annotated[int, Whole(0)] | None = None
+    ratio: tables.Plain = 1.0
+    sign: tables.Plain = 1.0
+    placement: tables.Placement | None = None
+
+
+@strict
+@dataclass(frozen=True, kw_only=True)
+class ElementsFile(tables.RobotTable):
+    """Robot file of a chain of elements.
+
+    Attributes:
+        joint: the actuated joints, in the order of q.
+        element: the elements, base to tip.
+    """
+
+    joint: tuple[JointTable, ...]
+    element: tuple[ElementTable, ...]
 
 
 def remarks(chain: Chain, bodies: bool = True) -> tuple[str, ...]:
@@ -175,7 +238,7 @@ def read_whole(path: str | Path, propose_beta: bool = True) -> tuple[Chain, Pars
         target = extra if key in EXTRA else robot
         target[key] = value
     if "element" in robot:
-        return _from_elements(robot, str(path)), extra
+        return from_elements(robot, str(path)), extra
     return mdh.from_table(robot, str(path), propose_beta), extra
 
 
@@ -205,55 +268,47 @@ def write(path: str | Path, chain: Chain, extra: Mapping[str, object] | None = N
     return files.write(path, tables.dumps(head | table | dict(extra or {})))
 
 
-def _from_elements(table: Mapping[str, object], where: str) -> Chain:
-    tables.check_keys(table, _TOP, where)
-    joints, inertias, links = [], [], []
-    for number, entry in enumerate(_tables(table, "joint", where), 1):
-        joint_where = f"{where}, [[joint]] number {number}"
-        tables.check_keys(entry, _JOINT, joint_where)
-        limits: FieldValues = {}
-        for key in tables.LIMITS:
-            if key in entry:
-                limits[key] = tables.number(entry[key], f"{joint_where}, {key}")
-        name = tables.word(entry, "name", joint_where)
-        kind = tables.word(entry, "kind", joint_where, "revolute")
-        joints.append(Joint(name, kind, **limits))
-        if "inertia" in entry:
-            inertias.append(tables.vector(entry["inertia"], 10, f"{joint_where}, inertia"))
-        if "link" in entry:
-            links.append(tables.word(entry, "link", joint_where))
-    if inertias and len(inertias) < len(joints):
+def from_elements(table: Mapping[str, Any], where: str) -> Chain:
+    """Return the chain of a parsed table of elements; `where` names it in messages."""
+    file = parse(ElementsFile, table, where, RobotError)
+    for key, entries in (("joint", file.joint), ("element", file.element)):
+        if not entries:
+            refuse_robot(where, f"no [[{key}]] tables found")
+    joints = []
+    for entry in file.joint:
+        limits = {key: getattr(entry, key) for key in tables.LIMITS}
+        stated_limits = {key: limit for key, limit in limits.items() if limit is not None}
+        joints.append(Joint(entry.name, entry.kind, **stated_limits))
+    bodies = [entry.inertia for entry in file.joint if entry.inertia is not None]
+    if bodies and len(bodies) < len(joints):
         refuse_robot(where, "some joints have an inertia and others have none: state all of them, or none")
+    inertias = None
+    if bodies:
+        inertias = np.array(bodies)
+    links = tuple(entry.link for entry in file.joint if entry.link is not None)
+    if len(links) < len(joints):
+        links = ()
     elements = []
-    for number, entry in enumerate(_tables(table, "element", where), 1):
-        elements.append(_element(entry, len(joints), f"{where}, [[element]] number {number}"))
+    for number, entry in enumerate(file.element, 1):
+        elements.append(_element(entry, len(joints), f"{where}: [[element]] number {number} ('{entry.name}')"))
     return Chain(
-        joints=tuple(joints),
-        elements=tuple(elements),
-        inertias=np.array(inertias) if inertias else None,
-        links=tuple(links) if len(links) == len(joints) else (),
-        **tables.chain_head(table, where),
+        joints=tuple(joints), elements=tuple(elements), inertias=inertias, links=links, **file.chain_fields(where)
     )
 
 
-def _element(entry: ParsedTable, n: int, where: str) -> Element:
-    tables.check_keys(entry, _ELEMENT, where)
-    name = tables.word(entry, "name", where)
-    where = f"{where} ('{name}')"
-    for key, highest in (("owner", n), ("joint", n - 1)):
-        value = entry.get(key, 0)
-        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= highest:
-            refuse_robot(where, f"{key} {value!r} is not an integer from 0 to {highest}")
-    axis = tables.word(entry, "axis", where)
-    sign = tables.number(entry.get("sign", 1.0), f"{where}, sign")
-    require(abs(sign) == 1.0, f"{where}: sign {sign:g} is neither 1 nor -1", RobotError)
-    quantity = "length" if axis[:1] == "t" else "angle"
-    value = tables.number(entry.get("value", 0.0), f"{where}, value", quantity)
-    ratio = tables.number(entry.get("ratio", 1.0), f"{where}, ratio")
+def _element(entry: ElementTable, n: int, where: str) -> Element:
+    """Return the element of a table, for a robot of n joints."""
+    if entry.owner > n:
+        refuse_robot(where, f"owner {entry.owner} is not an integer from 0 to {n}")
+    if entry.joint is not None and entry.joint >= n:
+        refuse_robot(where, f"joint {entry.joint} is not an integer from 0 to {n - 1}")
+    require(abs(entry.sign) == 1.0, f"{where}: sign {entry.sign:g} is neither 1 nor -1", RobotError)
+    quantity = "length" if entry.axis[:1] == "t" else "angle"
+    value = tables.number(entry.value, f"{where}, value", quantity)
     placement = None
-    if "placement" in entry:
-        placement = tables.placement(entry["placement"], f"{where}, placement")
-    return Element(name, axis, value, entry.get("owner", 0), entry.get("joint"), ratio, sign, placement)
+    if entry.placement is not None:
+        placement = entry.placement.transform(f"{where}, placement")
+    return Element(entry.name, entry.axis, value, entry.owner, entry.joint, entry.ratio, entry.sign, placement)
 
 
 def _to_elements(chain: Chain) -> dict[str, object]:
@@ -275,10 +330,3 @@ def _to_elements(chain: Chain) -> dict[str, object]:
             entry["placement"] = tables.placement_table(element.placement)
         elements.append(entry)
     return tables.chain_table(chain, joint=joints, element=elements)
-
-
-def _tables(table: Mapping[str, object], key: str, where: str) -> list[ParsedTable]:
-    entries = table.get(key)
-    if not isinstance(entries, list) or not entries or not all(isinstance(entry, Mapping) for entry in entries):
-        refuse_robot(where, f"no [[{key}]] tables found")
-    return entries

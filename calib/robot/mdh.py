@@ -43,22 +43,21 @@ The file, in TOML (numbers as in `calib.robot.tables`; angles in rad, lengths in
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.config_types import ParsedTable
+from calib.config import parse, strict
+from calib.config_types import Angle, Flag, Length, Name, Numeric, OneOf, Whole
 from calib.errors import RobotError, one_of, refuse_robot, require
 from calib.records import FieldValues
 from calib.robot import tables
 from calib.robot.chain import Chain, Element, Joint
 
 AXES = {"alpha": "rx", "d": "tx", "beta": "ry", "r": "tz", "theta": "rz"}
-TOP = ("name", "base", "tip", "gravity", "floor", "source", "propose_beta", "joint", "tail")
 KINDS = ("revolute", "prismatic", "fixed")
 MAX_SINE = 0.05  # of the angle between two axes that are nearly parallel
-_ROW = ("name", "kind", "index", "alpha", "d", "beta", "theta", "r", *tables.LIMITS, "inertia")
 _ELEMENT = re.compile(r"(alpha|d|beta|r|theta)(\d+)")
 
 
@@ -84,19 +83,65 @@ class Row:
         one_of(self.kind, KINDS, f"row '{self.name}': kind", RobotError)
 
 
-def from_table(table: ParsedTable, where: str, propose_beta: bool = True) -> Chain:
+@strict
+@dataclass(frozen=True)
+class RowTable:
+    """Table ``[[joint]]`` of an MDH file.
+
+    Attributes:
+        name: of the joint; default joint1, joint2 …
+        kind: of the joint.
+        index: number in the elements' names; default: the row before plus one, from 1.
+        alpha, theta: angles of the row [rad].
+        d, r: lengths of the row [m].
+        beta: rotation about y between nearly parallel axes [rad].
+        lower, upper: limits of the joint [rad or m].
+        velocity: limit [rad/s or m/s].
+        effort: limit [N m or N].
+        inertia: XX XY XZ YY YZ ZZ MX MY MZ M about the row's frame [kg m², kg m, kg].
+    """
+
+    name: Name | None = None
+    kind: Annotated[str, OneOf(KINDS)] = "revolute"
+    index: Annotated[int, Whole(0)] | None = None
+    alpha: Angle = 0.0
+    d: Length = 0.0
+    beta: Angle | None = None
+    theta: Angle = 0.0
+    r: Length = 0.0
+    lower: Numeric | None = None
+    upper: Numeric | None = None
+    velocity: Numeric | None = None
+    effort: Numeric | None = None
+    inertia: tables.Inertia | None = None
+
+
+@strict
+@dataclass(frozen=True, kw_only=True)
+class MdhFile(tables.RobotTable):
+    """Robot file of an MDH table.
+
+    Attributes:
+        propose_beta: add a rotation beta to rows whose axis is nearly parallel to the one before.
+        joint: one table per row, base to tip.
+    """
+
+    propose_beta: Flag = True
+    joint: tuple[RowTable, ...]
+
+
+def from_table(table: Mapping[str, Any], where: str, propose_beta: bool = True) -> Chain:
     """Return the chain of a parsed table; `where` names it in messages."""
-    tables.check_keys(table, TOP, where)
-    proposed = table.get("propose_beta", True)
-    if not isinstance(proposed, bool):
-        refuse_robot(where, f"propose_beta must be true or false, found {proposed!r}")
-    rows: list[Row] = []
-    if not isinstance(table.get("joint"), list) or not table["joint"]:
+    file = parse(MdhFile, table, where, RobotError)
+    if not file.joint:
         refuse_robot(where, "no [[joint]] rows found; an MDH table needs one per axis")
-    for number, entry in enumerate(table["joint"], 1):
-        next_index = rows[-1].index + 1 if rows else 1
-        rows.append(_row(entry, next_index, f"{where}, [[joint]] number {number}"))
-    return chain(rows=rows, propose_beta=propose_beta and proposed, **tables.chain_head(table, where))
+    rows: list[Row] = []
+    for number, entry in enumerate(file.joint, 1):
+        next_index = 1
+        if rows:
+            next_index = rows[-1].index + 1
+        rows.append(_row(entry, next_index, f"{where}: [[joint]] number {number}"))
+    return chain(rows=rows, propose_beta=propose_beta and file.propose_beta, **file.chain_fields(where))
 
 
 def chain(name: str, rows: Sequence[Row], propose_beta: bool = True, **fields: Any) -> Chain:
@@ -198,32 +243,37 @@ def _parallel(rows: Iterable[Row]) -> set[int]:
     return indices
 
 
-def _row(entry: object, index: int, where: str) -> Row:
-    """Return the row of one [[joint]] table."""
-    if not isinstance(entry, Mapping):
-        refuse_robot(where, f"expected a table, found {entry!r}")
-    index = entry.get("index", index)
-    if isinstance(index, bool) or not isinstance(index, int) or index < 0:
-        refuse_robot(where, f"index {index!r} is not an integer of 0 or more")
-    name = tables.word(entry, "name", where, f"joint{index}")
+def _row(entry: RowTable, next_index: int, where: str) -> Row:
+    """Return the row of one [[joint]] table, its limits in SI units by the kind of joint."""
+    index = next_index if entry.index is None else entry.index
+    name = f"joint{index}" if entry.name is None else entry.name
     where = f"{where} ('{name}')"
-    tables.check_keys(entry, _ROW, where)
-    kind = tables.word(entry, "kind", where, "revolute")
-    quantity = dict.fromkeys(("alpha", "beta", "theta", "lower", "upper"), "angle") | {"d": "length", "r": "length"}
-    quantity |= {"velocity": "angular speed", "effort": "torque"}
-    if kind == "prismatic":
-        quantity |= {"lower": "length", "upper": "length", "velocity": "speed", "effort": "force"}
-    if kind == "fixed":
-        for key in (*tables.LIMITS, "inertia"):
-            if key in entry:
-                refuse_robot(where, f"a fixed row cannot have '{key}': remove the key")
-    numbers: FieldValues = {
-        key: tables.number(entry[key], f"{where}, {key}", quantity[key]) for key in quantity if key in entry
-    }
-    inertia = None
-    if "inertia" in entry:
-        inertia = tuple(tables.vector(entry["inertia"], 10, f"{where}, inertia").tolist())
-    return Row(name=name, index=index, kind=kind, inertia=inertia, **numbers)
+    quantities = {"lower": "angle", "upper": "angle", "velocity": "angular speed", "effort": "torque"}
+    if entry.kind == "prismatic":
+        quantities = {"lower": "length", "upper": "length", "velocity": "speed", "effort": "force"}
+    limits: dict[str, float] = {}
+    for key, quantity in quantities.items():
+        value = getattr(entry, key)
+        if value is not None:
+            limits[key] = tables.number(value, f"{where}, {key}", quantity)
+    if entry.kind == "fixed":
+        surplus = [*limits]
+        if entry.inertia is not None:
+            surplus.append("inertia")
+        if surplus:
+            refuse_robot(where, f"a fixed row cannot have '{surplus[0]}': remove the key")
+    return Row(
+        name=name,
+        index=index,
+        kind=entry.kind,
+        alpha=entry.alpha,
+        d=entry.d,
+        theta=entry.theta,
+        r=entry.r,
+        beta=entry.beta,
+        inertia=entry.inertia,
+        **limits,
+    )
 
 
 def _regroup(chain: Chain, index: int, group: list[Element]) -> Row:

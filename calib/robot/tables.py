@@ -6,21 +6,121 @@ behind it: ``"-pi/2"``, ``"90 deg"``, ``"110 deg/s"``, ``"-313 mm"`` (`calib.con
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
+from typing import Annotated, Any
 
 import numpy as np
 import rtoml
 
 from calib import config, config_types
-from calib.config_types import shown
+from calib.config_types import Angle, Checked, Length, Name, Real, Text, shown
 from calib.errors import RobotError, refuse_robot
-from calib.records import FieldValues
 from calib.robot.chain import Chain
 from calib.transforms import from_xyz_rpy, to_xyz_rpy
 
 _PI = {math.pi: "pi", -math.pi: "-pi", math.pi / 2: "pi/2", -math.pi / 2: "-pi/2"}
 
 LIMITS = ("lower", "upper", "velocity", "effort")
+# Tables of a robot file that belong to other readers: `calib.geometry.installation`, `calib.robot.calibrated`.
+EXTRA = ("station", "tool", "camera", "board", "deflection", "truth", "provenance")
+
+# A number without unit, and one that may be infinite.
+Plain = Annotated[float, Real(quantity="1")]
+Unlimited = Annotated[float, Real(quantity="1", infinite=True)]
+Vector = tuple[Plain, Plain, Plain]
+# XX XY XZ YY YZ ZZ MX MY MZ M about the joint's frame [kg m², kg m, kg]
+Inertia = tuple[Plain, Plain, Plain, Plain, Plain, Plain, Plain, Plain, Plain, Plain]
+
+
+def _placement_table(value: Any) -> Any:
+    if not isinstance(value, Mapping):
+        raise ValueError(f"expected xyz and rpy, or matrix; found {shown(value)}")
+    return value
+
+
+def _foreign(value: Any) -> Any:
+    return value
+
+
+@config.strict
+@dataclass(frozen=True)
+class PlacementTable:
+    """Where a frame stands in another one.
+
+    Attributes:
+        xyz: position [m].
+        rpy: roll, pitch and yaw [rad].
+        matrix: in place of both: three or four rows of the homogeneous transform.
+    """
+
+    xyz: tuple[Length, Length, Length] = (0.0, 0.0, 0.0)
+    rpy: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
+    matrix: tuple[tuple[Plain, Plain, Plain, Plain], ...] | None = None
+
+    def transform(self, where: str) -> np.ndarray:
+        """Return the transform (4, 4); `where` names the table in complaints."""
+        if self.matrix is None:
+            return from_xyz_rpy(np.array(self.xyz), np.array(self.rpy))
+        if len(self.matrix) not in (3, 4):
+            refuse_robot(where, "matrix needs three or four rows")
+        result = np.eye(4)
+        result[: len(self.matrix)] = self.matrix
+        rotation = result[:3, :3]
+        error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+        if not error < 1e-6 or np.linalg.det(rotation) < 0:
+            refuse_robot(where, f"the upper left 3 x 3 of matrix is not a rotation (R'R - 1 = {error:.2g})")
+        return result
+
+
+Placement = Annotated[PlacementTable, Checked(_placement_table)]
+# Table, or list of tables, that another reader takes.
+Foreign = Annotated[Any, Checked(_foreign, {"type": ["object", "array"]})]
+
+
+@config.strict
+@dataclass(frozen=True, kw_only=True)
+class RobotTable:
+    """Keys that the robot files of serial arms share.
+
+    Attributes:
+        name: of the robot.
+        base, tip: names of its two ends.
+        gravity: in the base frame [m/s²].
+        floor: height of what it stands on, in the base frame [m].
+        source: where the numbers come from.
+        tail: what follows the last joint or row.
+        station, tool, camera, board, deflection, truth, provenance: of a fit.
+    """
+
+    name: Name
+    base: Name | None = None
+    tip: Name | None = None
+    gravity: Vector | None = None
+    floor: Length = 0.0
+    source: Text = ""
+    tail: Placement | None = None
+    station: Foreign = None
+    tool: Foreign = None
+    camera: Foreign = None
+    board: Foreign = None
+    deflection: Foreign = None
+    truth: Foreign = None
+    provenance: Foreign = None
+
+    def chain_fields(self, where: str) -> dict[str, Any]:
+        """Return the fields of a `Chain` that these keys give; `where` names the file in complaints."""
+        result: dict[str, Any] = {"name": self.name, "floor": self.floor}
+        if self.base is not None:
+            result["base"] = self.base
+        if self.tip is not None:
+            result["tip"] = self.tip
+        if self.tail is not None:
+            result["tail"] = self.tail.transform(f"{where}: tail")
+        if self.gravity is not None:
+            result["gravity"] = np.array(self.gravity)
+        return result
+
 
 load = partial(config.read_toml, error=RobotError)
 check_keys = partial(config.check_keys, error=RobotError)
@@ -50,20 +150,7 @@ def placement(table: object, where: str) -> np.ndarray:
     """Return a transform (4, 4) from a table ``{xyz, rpy}`` [m, rad] or ``{matrix}`` (three or four rows)."""
     if not isinstance(table, Mapping):
         refuse_robot(where, f"expected xyz and rpy, or matrix; found {shown(table)}")
-    check_keys(table, ("xyz", "rpy", "matrix"), where)
-    if "matrix" not in table:
-        zero = [0.0, 0.0, 0.0]
-        xyz = vector(table.get("xyz", zero), 3, f"{where}, xyz", "length")
-        return from_xyz_rpy(xyz, vector(table.get("rpy", zero), 3, f"{where}, rpy", "angle"))
-    rows = table["matrix"]
-    if not isinstance(rows, (list, tuple)) or len(rows) not in (3, 4):
-        refuse_robot(where, "matrix needs three or four rows")
-    result = np.eye(4)
-    result[: len(rows)] = [vector(row, 4, f"{where}, matrix") for row in rows]
-    error = np.abs(result[:3, :3].T @ result[:3, :3] - np.eye(3)).max()
-    if not error < 1e-6 or np.linalg.det(result[:3, :3]) < 0:
-        refuse_robot(where, f"the upper left 3 x 3 of matrix is not a rotation (R'R - 1 = {error:.2g})")
-    return result
+    return config.parse(PlacementTable, table, where, RobotError).transform(where)
 
 
 def placement_table(transform: np.ndarray) -> dict[str, list]:
@@ -82,22 +169,8 @@ def spelled(angle: float) -> float | str:
     return _PI.get(angle, angle)
 
 
-def chain_head(table: Mapping[str, object], where: str) -> FieldValues:
-    """Return the fields of a `Chain` in a robot's table except its joints: name, ends, tail, gravity, floor."""
-    head: FieldValues = {"name": word(table, "name", where)}
-    for key in ("base", "tip"):
-        if key in table:
-            head[key] = word(table, key, where)
-    if "tail" in table:
-        head["tail"] = placement(table["tail"], f"{where}, [tail]")
-    if "gravity" in table:
-        head["gravity"] = vector(table["gravity"], 3, f"{where}, gravity")
-    head["floor"] = number(table.get("floor", 0.0), f"{where}, floor", "length")
-    return head
-
-
 def chain_table(chain: Chain, **rows: object) -> dict[str, object]:
-    """Return the table of a chain that `chain_head` reads back exactly; `rows` stand before its tail."""
+    """Return the table of a chain that `RobotTable` reads back exactly; `rows` stand before its tail."""
     table: dict[str, object] = {"name": chain.name, "base": chain.base, "tip": chain.tip}
     table["gravity"] = chain.gravity.tolist()
     if chain.floor:

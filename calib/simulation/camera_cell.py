@@ -37,10 +37,31 @@ if TYPE_CHECKING:
     from calib.simulation.rendered_camera import Imaging
 
 CHARUCO = Board("charuco", 9, 7, 0.03, 0.021)
-FIVE_MEGAPIXEL = Lens(
-    "pinhole", np.array([2400.0, 2405.0, 1220.0, 1010.0, -0.12, 0.05, 4e-4, -3e-4, 0.0]), (2448, 2048)
-)  # an 8 mm lens before 3.45 µm pixels, about
-RANGE, TILT = (0.35, 0.8), 0.7  # distance [m] and largest tilt [rad] of what is looked at; our choice
+# corners in view of a board that need not be fully in view
+MIN_CORNERS = 12
+
+# intrinsics fx, fy, cx, cy [px] and distortion k1, k2, p1, p2, k3 of an 8 mm lens before 3.45 µm pixels, about
+FIVE_MEGAPIXEL_INTRINSICS = np.array([2400.0, 2405.0, 1220.0, 1010.0, -0.12, 0.05, 4e-4, -3e-4, 0.0])
+FIVE_MEGAPIXEL = Lens("pinhole", FIVE_MEGAPIXEL_INTRINSICS, (2448, 2048))
+
+# distance [m] and largest tilt [rad] of the board; our choice
+RANGE = (0.35, 0.8)
+TILT = 0.7
+
+# 1.3 megapixels with the distortion of the lens above
+DEMO_INTRINSICS = np.array([1250.0, 1252.0, 640.0, 508.0, -0.12, 0.05, 4e-4, -3e-4, 0.0])
+DEMO_LENS = Lens("pinhole", DEMO_INTRINSICS, (1280, 1024))
+# digits to which placements are stated [m, rad]
+DIGITS = 2
+LIMITS = """[camera]
+mounting = "in hand"
+lens = "camera.yaml"
+board = "board.toml"
+carried = {{xyz = {carried[0]}, rpy = {carried[1]}}}
+stands = {{xyz = {stands[0]}, rpy = {stands[1]}}}
+range = [0.25, 0.7]
+tilt = "45 deg"
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,38 +118,54 @@ def camera_cell(
     arm = cell.truth.chain
     reach = reach_of_arm or _reach(arm)
     middle = 0.5 * np.array([*board.extent, 0.0])
+    from_middle = pose(None, -middle)
+    if mounting == IN_HAND:
+        # the board lies on a table beside the base, facing up
+        facing_up = Rotation.from_euler("x", np.pi)
+        table = np.array([0.55 * reach, 0.0, 0.0])
+        station = invert(pose(facing_up, table) @ from_middle)
+        station_name, tool_name = "board", "camera"
+        camera_turn = Rotation.from_euler("xyz", [0.05, -0.1, 0.6])
+        tool = pose(camera_turn, [0.04, 0.02, 0.06])
+    else:
+        # the camera stands beyond the workspace and looks at the base's axis
+        eye = reach * np.array([1.2, -0.15, 0.65])
+        target = reach * np.array([0.35, 0.0, 0.35])
+        station = invert(_looking(eye, target))
+        station_name, tool_name = "camera", "board"
+        board_turn = Rotation.from_euler("xyz", [0.1, 0.15, 0.3])
+        tool = pose(board_turn, [0.02, 0.03, 0.05]) @ from_middle
     optics = Optics((lens,), ("camera",), (shape or BoardShape(),), ("board",))
-    if mounting == IN_HAND:  # the board lies on a table beside the base, facing up
-        board_pose = pose(Rotation.from_euler("x", np.pi), np.array([0.55 * reach, 0.0, 0.0])) @ pose(None, -middle)
-        station, names = invert(board_pose), ("board", "camera")
-        tool = pose(Rotation.from_euler("xyz", [0.05, -0.1, 0.6]), [0.04, 0.02, 0.06])
-    else:  # the camera stands beyond the workspace and looks at the base's axis
-        eye = np.array([1.2 * reach, -0.15 * reach, 0.65 * reach])
-        station, names = invert(_looking(eye, np.array([0.35 * reach, 0.0, 0.35 * reach]))), ("camera", "board")
-        tool = pose(Rotation.from_euler("xyz", [0.1, 0.15, 0.3]), [0.02, 0.03, 0.05]) @ pose(None, -middle)
     truth = Installation(
-        arm, station[None], tool[None], names[:1], names[1:], deflection=cell.truth.deflection, optics=optics
+        arm, station[None], tool[None], (station_name,), (tool_name,), deflection=cell.truth.deflection, optics=optics
     )
     note = f"{cell.note}; a camera {mounting} sees a {board.words}"
-    return CameraCell(replace(cell, truth=truth, note=note), board, mounting)
+    seen_cell = replace(cell, truth=truth, note=note)
+    return CameraCell(seen_cell, board, mounting)
 
 
 def _reach(chain: Chain) -> float:
-    return float(np.quantile(np.linalg.norm(forward(chain, random_joints(chain, 500, 0))[:, :3, 3], axis=1), 0.9))
+    poses = forward(chain, random_joints(chain, 500, 0))
+    distances = np.linalg.norm(poses[:, :3, 3], axis=1)
+    return float(np.quantile(distances, 0.9))
 
 
-def _looking(eye: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Return the pose of a camera at `eye` (3,) [m] that looks at a point, with horizontal x axis."""
-    ahead = (at - eye) / np.linalg.norm(at - eye)
+def _looking(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Return the pose of a camera at `eye` (3,) [m] that looks at `target` (3,) [m], with horizontal x axis."""
+    ahead = target - eye
+    ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)
-    return pose(np.column_stack([right, np.cross(ahead, right), ahead]), eye)
+    down = np.cross(ahead, right)
+    return pose(np.column_stack([right, down, ahead]), eye)
 
 
 def board_poses(camera: CameraCell, q: np.ndarray) -> np.ndarray:
     """Return the board's true poses (m, 4, 4) in the camera's frame."""
     poses = true_poses(camera.cell, q)
-    return invert(poses) if camera.mounting == IN_HAND else poses
+    if camera.mounting == IN_HAND:
+        return invert(poses)
+    return poses
 
 
 def views(
@@ -145,17 +182,23 @@ def views(
     Raises:
         CannotSimulate: where hardly any are found.
     """
-    sought, arm = sought or Views(), camera.cell.nominal
-    min_distance, max_distance = (
-        sought.distance if camera.mounting == IN_HAND else (2.0 * sought.distance[0], 3.0 * sought.distance[1])
-    )
+    sought = sought or Views()
+    min_distance, max_distance = sought.distance
+    if camera.mounting != IN_HAND:
+        # a camera beside the arm stands farther away
+        min_distance, max_distance = 2.0 * min_distance, 3.0 * max_distance
+    min_corners = MIN_CORNERS
+    if sought.whole:
+        min_corners = len(corners(camera.board))
+
+    def in_view(candidates: np.ndarray) -> np.ndarray:
+        return visible(camera, candidates).sum(axis=1) >= min_corners
+
+    arm = camera.cell.nominal
     cell = replace(camera.cell.truth, chain=arm, deflection=Deflection())
     view = CameraView(cell, camera.board, camera.mounting, sought.tilt, (min_distance, max_distance), 0.0)
-
-    min_corners = len(corners(camera.board)) if sought.whole else 12
-    q = view.draw(
-        count, lambda candidates: visible(camera, candidates).sum(axis=1) >= min_corners, *arm.sampling_limits(), seed
-    )
+    lower, upper = arm.sampling_limits()
+    q = view.draw(count, in_view, lower, upper, seed)
     if len(q) < count:
         raise CannotSimulate(f"the camera sees the board at hardly any posture of the arm ({len(q)} of {count} found)")
     return q
@@ -164,14 +207,18 @@ def views(
 def visible(camera: CameraCell, q: np.ndarray) -> np.ndarray:
     """Return whether each corner is visible to the camera at joint values q (m, n): (m, K) bool."""
     poses = board_poses(camera, q)
-    flat = _points(camera, poses).reshape(-1, 3)
-    facing = np.einsum("mi,mi->m", poses[:, :3, 2], poses[:, :3, 3]) > 0.0
-    return camera.lens.in_sight(flat, 6.0).reshape(len(q), len(corners(camera.board))) & facing[:, None]
+    points = _points(camera, poses)
+    in_sight = camera.lens.in_sight(points.reshape(-1, 3), 6.0)
+    normals, positions = poses[:, :3, 2], poses[:, :3, 3]
+    facing = np.einsum("mi,mi->m", normals, positions) > 0.0
+    return in_sight.reshape(points.shape[:2]) & facing[:, None]
 
 
 def _points(camera: CameraCell, poses: np.ndarray) -> np.ndarray:
+    """Return the corners (m, K, 3) [m] of the printed board in the camera's frame."""
     table = shaped_points(camera.board, camera.shape, corners(camera.board))
-    return np.einsum("mij,kj->mki", poses[:, :3, :3], table) + poses[:, None, :3, 3]
+    turned = np.einsum("mij,kj->mki", poses[:, :3, :3], table)
+    return turned + poses[:, None, :3, 3]
 
 
 def photograph(
@@ -181,13 +228,17 @@ def photograph(
 
     The recorded joints carry the encoders' noise.
     """
-    rng, names = np.random.default_rng(seed), camera.cell.truth
-    in_view, points = visible(camera, q), _points(camera, board_poses(camera, q))
-    flat = np.where(in_view.reshape(-1, 1), points.reshape(-1, 3), [0.0, 0.0, 1.0])
-    pixel = camera.lens.project(flat).reshape(*in_view.shape, 2)
-    pixel = np.where(in_view[:, :, None], pixel + rng.normal(0.0, noise, pixel.shape), np.nan)
-    recorded = q + rng.normal(0.0, camera.cell.instrument.encoder_sigma, q.shape)
-    free = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")
+    rng = np.random.default_rng(seed)
+    in_view = visible(camera, q)
+    points = _points(camera, board_poses(camera, q))
+    # corners out of view are projected from a point that is in view, and dropped below
+    points = np.where(in_view[:, :, None], points, [0.0, 0.0, 1.0])
+    pixel = camera.lens.project(points.reshape(-1, 3))
+    pixel = pixel.reshape(*in_view.shape, 2)
+    pixel = pixel + rng.normal(0.0, noise, pixel.shape)
+    pixel = np.where(in_view[:, :, None], pixel, np.nan)
+    recorded = _recorded(camera, q, rng)
+    truth = camera.cell.truth
     return Pixels(
         recorded,
         camera.cell.nominal.joint_names,
@@ -195,13 +246,22 @@ def photograph(
         camera.board,
         None,
         sigma=np.full(in_view.shape, max(noise, 1e-3)),
-        station=names.station_names[0],
-        tool_names=names.tool_names,
+        station=truth.station_names[0],
+        tool_names=truth.tool_names,
         size=camera.lens.size,
         file=file,
-        free=free,
-        names=tuple(f"{k + 1:04}.png" for k in range(len(q))),
+        free=("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+        names=tuple(_image_names(len(q))),
     )
+
+
+def _recorded(camera: CameraCell, q: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return joint values (m, n) with the encoders' noise [rad or m]."""
+    return q + rng.normal(0.0, camera.cell.instrument.encoder_sigma, q.shape)
+
+
+def _image_names(count: int) -> list[str]:
+    return [f"{number:04}.png" for number in range(1, count + 1)]
 
 
 def take_pictures(
@@ -228,35 +288,31 @@ def take_pictures(
     from calib.simulation.rendered_camera import render
 
     boards.write_board(camera.board, folder / BOARD)
-    rng = np.random.default_rng([seed, 11])
-    recorded = q + rng.normal(0.0, camera.cell.instrument.encoder_sigma, q.shape)
-    names = [f"{k + 1:04}.png" for k in range(len(q))]
+    recorded = _recorded(camera, q, np.random.default_rng([seed, 11]))
+    names = _image_names(len(q))
     for k, name in enumerate(names):
         if say:
             say(f"rendering {folder.name}/{name}")
         exposure_joints = q[k : k + 1]
         if moving is not None and moving[k].any():
-            exposure_joints = q[k] + np.linspace(-0.5, 0.5, 7)[:, None] * moving[k]
-        poses, noise = board_poses(camera, exposure_joints), np.random.default_rng([seed, k])
-        write_image(folder / name, render(camera.board, camera.lens, poses, imaging, noise, camera.shape))
-    units = [JOINT[joint.kind] for joint in camera.cell.nominal.joints]
-    heads = [f"{joint_name} [{unit}]" for joint_name, (_, unit) in zip(camera.cell.nominal.joint_names, units)]
-    rows = [[name, *map(float, row * [factor for factor, _ in units])] for name, row in zip(names, recorded)]
-    files.write_table(folder / JOINTS, ["image", *heads], rows)
+            share_of_exposure = np.linspace(-0.5, 0.5, 7)[:, None]
+            exposure_joints = q[k] + share_of_exposure * moving[k]
+        poses = board_poses(camera, exposure_joints)
+        noise = np.random.default_rng([seed, k])
+        image = render(camera.board, camera.lens, poses, imaging, noise, camera.shape)
+        write_image(folder / name, image)
+
+    header = ["image"]
+    factors = []
+    for joint in camera.cell.nominal.joints:
+        factor, unit = JOINT[joint.kind]
+        header.append(f"{joint.name} [{unit}]")
+        factors.append(factor)
+    rows = []
+    for name, joints in zip(names, recorded):
+        rows.append([name, *map(float, joints * factors)])
+    files.write_table(folder / JOINTS, header, rows)
     return folder
-
-
-DEMO_LENS = Lens("pinhole", np.array([1250.0, 1252.0, 640.0, 508.0, -0.12, 0.05, 4e-4, -3e-4, 0.0]), (1280, 1024))
-DIGITS = 2  # digits to which places are stated [m, rad]
-LIMITS = """[camera]
-mounting = "in hand"
-lens = "camera.yaml"
-board = "board.toml"
-carried = {{xyz = {carried[0]}, rpy = {carried[1]}}}
-stands = {{xyz = {stands[0]}, rpy = {stands[1]}}}
-range = [0.25, 0.7]
-tilt = "45 deg"
-"""
 
 
 def seen_by_camera(cell: Cell) -> CameraCell:
@@ -267,12 +323,15 @@ def seen_by_camera(cell: Cell) -> CameraCell:
 @contextmanager
 def limits_of(camera: CameraCell) -> Iterator[Path]:
     """Yield a constraints file with the camera's approximate placement, next to its lens and board files."""
-    truth, middle = camera.cell.truth, pose(None, 0.5 * np.array([*camera.board.extent, 0.0]))
-    places = {"carried": truth.tools[0], "stands": invert(truth.stations[0]) @ middle}
-    placements = {
-        name: [np.round(part, DIGITS).tolist() for part in to_xyz_rpy(frame)] for name, frame in places.items()
-    }
+    truth = camera.cell.truth
+    middle = pose(None, 0.5 * np.array([*camera.board.extent, 0.0]))
+    frames = {"carried": truth.tools[0], "stands": invert(truth.stations[0]) @ middle}
+    placements = {}
+    for name, frame in frames.items():
+        xyz, rpy = to_xyz_rpy(frame)
+        placements[name] = [np.round(xyz, DIGITS).tolist(), np.round(rpy, DIGITS).tolist()]
     with tempfile.TemporaryDirectory(prefix="calib-demo-", ignore_cleanup_errors=True) as folder:
         write_lens(camera.lens, Path(folder, "camera.yaml"))
         boards.write_board(camera.board, Path(folder, BOARD))
-        yield files.write(Path(folder, "limits.toml"), LIMITS.format(**placements))
+        limits = LIMITS.format(**placements)
+        yield files.write(Path(folder, "limits.toml"), limits)

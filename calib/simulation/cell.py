@@ -32,6 +32,9 @@ from calib.robot.kinematics import gravity_torques
 from calib.simulation.unmodelled import PositionErrors, displacements, drooping
 from calib.transforms import invert, pose
 
+# pose lists that a session plans, and the names of their measurements
+PLANS = (("poses", "measured"), ("validation_poses", "validation_measured"))
+
 
 @dataclass(frozen=True)
 class SimulatedInstrument:
@@ -85,13 +88,15 @@ def true_poses(cell: Cell, q: np.ndarray, warm: float = np.inf) -> np.ndarray:
         q: (m, n) joint values in the order in which the arm takes them [rad or m].
         warm: how many poses the arm has moved to before; infinite for a warm arm.
     """
-    q = shaped(q, (None, cell.truth.chain.n), "joint values")
     arm = cell.truth.chain
-    torque = np.zeros(q.shape) if arm.inertias is None else gravity_torques(arm, q)
+    q = shaped(q, (None, arm.n), "joint values")
+    torque = np.zeros(q.shape)
+    if arm.inertias is not None:
+        torque = gravity_torques(arm, q)
     bases = evaluate(cell.truth.deflection, q, torque)
     unmodelled_errors = displacements(cell.unmodelled, arm, q, torque, warm)
-    tool_poses = see(cell.truth, q, bases=bases, displacements=unmodelled_errors).poses()
-    return drooping(cell.unmodelled, arm, tool_poses, cell.truth.stations[0])
+    sweep = see(cell.truth, q, bases=bases, displacements=unmodelled_errors)
+    return drooping(cell.unmodelled, arm, sweep.poses(), cell.truth.stations[0])
 
 
 def measure(
@@ -109,25 +114,30 @@ def measure(
     Returns:
         Poses (or positions), with the sigmas that the instrument's maker states, drift and outliers not included.
     """
-    rng, instrument = np.random.default_rng(seed), cell.instrument
+    rng = np.random.default_rng(seed)
+    instrument = cell.instrument
     measured = _noisy(true_poses(cell, q, warm=warm), instrument, rng)
     sigma, sigma_rotation = _stated(instrument, np.zeros((len(q), 3)))
     if instrument.base_frame is not None:
         base = cell.truth.stations[0] @ instrument.base_frame
-        measured = invert(_noisy(np.broadcast_to(base, measured.shape), instrument, rng)) @ measured
+        base_poses = np.broadcast_to(base, measured.shape)
+        measured_bases = _noisy(base_poses, instrument, rng)
+        measured = invert(measured_bases) @ measured
         sigma, sigma_rotation = _stated(instrument, measured[:, :3, 3], frames=2)
-    measured[:, :3, 3] += _gross_errors(instrument, len(q), rng)
+    position = measured[:, :3, 3] + _gross_errors(instrument, len(q), rng)
+    recorded = np.asarray(q) + rng.normal(0.0, instrument.encoder_sigma, np.shape(q))
     common: dict[str, Any] = {
         "sigma": sigma,
         "station": cell.truth.station_names[0],
         "tool_names": cell.truth.tool_names,
         "file": file,
     }
-    q, names = np.asarray(q) + rng.normal(0.0, instrument.encoder_sigma, np.shape(q)), cell.nominal.joint_names
+    joint_names = cell.nominal.joint_names
     if instrument.orientation_sigma is None:
-        return Positions(q, names, measured[:, :3, 3], **common)
-    turns = Rotation.from_matrix(measured[:, :3, :3]).as_quat(canonical=True)
-    return Poses(q, names, measured[:, :3, 3], turns, sigma_rotation=sigma_rotation, **common)
+        return Positions(recorded, joint_names, position, **common)
+    turns = Rotation.from_matrix(measured[:, :3, :3])
+    quaternion = turns.as_quat(canonical=True)
+    return Poses(recorded, joint_names, position, quaternion, sigma_rotation=sigma_rotation, **common)
 
 
 def wandering(measured: Positions, drift: float, seed: int, begin: float = 0.0) -> Positions:
@@ -136,16 +146,19 @@ def wandering(measured: Positions, drift: float, seed: int, begin: float = 0.0) 
     The direction is the seed's, so that several series can share it.
     """
     direction = np.random.default_rng([seed, 5]).standard_normal(3)
-    displacement = np.linspace(begin, 1.0, len(measured))[:, None] * direction / np.linalg.norm(direction)
+    share = np.linspace(begin, 1.0, len(measured))[:, None]
+    displacement = share * direction / np.linalg.norm(direction)
     return replace(measured, position=measured.position + drift * displacement)
 
 
 def _noisy(poses: np.ndarray, instrument: SimulatedInstrument, rng: np.random.Generator) -> np.ndarray:
     """Return measured poses (m, 4, 4): noise along and about the instrument's axes."""
     m = len(poses)
-    turn = Rotation.from_rotvec(rng.normal(0.0, instrument.orientation_sigma or 0.0, (m, 3))).as_matrix()
+    turn_sigma = instrument.orientation_sigma or 0.0
+    rotation_vectors = rng.normal(0.0, turn_sigma, (m, 3))
+    turns = Rotation.from_rotvec(rotation_vectors).as_matrix()
     shift = rng.normal(0.0, instrument.position_sigma, (m, 3))
-    return pose(turn @ poses[:, :3, :3], poses[:, :3, 3] + shift)
+    return pose(turns @ poses[:, :3, :3], poses[:, :3, 3] + shift)
 
 
 def _stated(instrument: SimulatedInstrument, lever: np.ndarray, frames: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -154,7 +167,8 @@ def _stated(instrument: SimulatedInstrument, lever: np.ndarray, frames: int = 1)
     Seen from a noisy base frame at the distance l, σ_x² = 2 σ_p² + σ_r² (l_y² + l_z²), and so on.
     """
     turning = instrument.orientation_sigma or 0.0
-    across = (lever**2).sum(axis=1, keepdims=True) - lever**2
+    squares = lever**2
+    across = squares.sum(axis=1, keepdims=True) - squares
     sigma = np.sqrt(frames * instrument.position_sigma**2 + turning**2 * across)
     return sigma, np.full(lever.shape, turning * np.sqrt(frames))
 
@@ -163,16 +177,18 @@ def _gross_errors(instrument: SimulatedInstrument, m: int, rng: np.random.Genera
     """Return the position errors (m, 3) [m] of m rows from drift and outliers."""
     directions = rng.normal(size=(m + 1, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    wandering = instrument.drift * np.linspace(0.0, 1.0, m)[:, None] * directions[-1]
+    drift = instrument.drift * np.linspace(0.0, 1.0, m)
     hit = rng.uniform(size=m) < instrument.outlier_share
-    return wandering + instrument.outlier_size * hit[:, None] * directions[:-1]
+    outliers = instrument.outlier_size * hit
+    return drift[:, None] * directions[-1] + outliers[:, None] * directions[:-1]
 
 
 def planned_poses(folder: Path, arm: Chain) -> Iterator[tuple[int, str, np.ndarray]]:
     """Yield the pose lists planned by the session in `folder` for an arm: number, name when measured, q (m, n)."""
     joints = Joints(arm.joint_names, joint_kinds(arm))
-    for number, (plan, name) in enumerate((("poses", "measured"), ("validation_poses", "validation_measured"))):
-        if (path := folder / f"2-poses/{plan}.csv").exists():
+    for number, (plan, name) in enumerate(PLANS):
+        path = folder / f"2-poses/{plan}.csv"
+        if path.exists():
             yield number, name, read_poses(path, joints)
 
 
@@ -184,18 +200,23 @@ def write_measured(measured: Positions, path: str | Path, degrees: bool = True) 
         path: of the file.
         degrees: False for SI units throughout.
     """
-    angle, length, unit = (180.0 / np.pi, 1e3, ("deg", "mm")) if degrees else (1.0, 1.0, ("rad", "m"))
+    angle, length = 1.0, 1.0
+    angle_unit, length_unit = "rad", "m"
+    if degrees:
+        angle, length = 180.0 / np.pi, 1e3
+        angle_unit, length_unit = "deg", "mm"
+    header = [f"{name} [{angle_unit}]" for name in measured.joint_names]
+    header += [f"{axis} [{length_unit}]" for axis in "xyz"]
     columns = [angle * measured.q, length * measured.position]
-    header = [f"{name} [{unit[0]}]" for name in measured.joint_names] + [f"{axis} [{unit[1]}]" for axis in "xyz"]
     if isinstance(measured, Poses):
-        columns.append(measured.quaternion)
         header += ["qx", "qy", "qz", "qw"]
+        columns.append(measured.quaternion)
     if measured.sigma is not None:
+        header += [f"sigma_{axis} [{length_unit}]" for axis in "xyz"]
         columns.append(length * measured.sigma)
-        header += [f"sigma_{axis} [{unit[1]}]" for axis in "xyz"]
     if isinstance(measured, Poses) and measured.sigma_rotation is not None:
-        columns.append(measured.sigma_rotation)
         header += [f"sigma_r{axis} [rad]" for axis in "xyz"]
+        columns.append(measured.sigma_rotation)
     return files.write_numbers(path, header, np.hstack(columns))
 
 
@@ -204,13 +225,20 @@ def write_log(recording: Recording, path: str | Path, degrees: bool = True) -> P
 
     Seven digits, as controllers log.
     """
-    angle, unit = (180.0 / np.pi, "deg") if degrees else (1.0, "rad")
-    series = [("q", angle * recording.q, unit), ("tau", recording.effort, "Nm")]
+    angle, angle_unit = 1.0, "rad"
+    if degrees:
+        angle, angle_unit = 180.0 / np.pi, "deg"
+    series = [("q", angle * recording.q, angle_unit), ("tau", recording.effort, "Nm")]
     if recording.tau_link is not None:
         series.append(("tau_link", recording.tau_link, "Nm"))
-    header = ["t [s]", *(f"{key}_{name} [{unit}]" for key, _, unit in series for name in recording.joint_names)]
-    table = np.hstack([recording.t[:, None], *(values for _, values, _ in series)])
+    header = ["t [s]"]
+    columns = [recording.t[:, None]]
+    for key, values, unit in series:
+        header += [f"{key}_{name} [{unit}]" for name in recording.joint_names]
+        columns.append(values)
+    table = np.hstack(columns)
+    formats = ["%.4f"] + ["%.7g"] * (table.shape[1] - 1)
     text = io.StringIO()
     text.write(",".join(header) + "\n")
-    np.savetxt(text, table, fmt=["%.4f"] + ["%.7g"] * (table.shape[1] - 1), delimiter=",")
+    np.savetxt(text, table, fmt=formats, delimiter=",")
     return files.write(path, text.getvalue())

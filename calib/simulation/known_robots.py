@@ -32,11 +32,14 @@ def _fourier(
         duration, rate: [s], [Hz].
     """
     t = np.arange(round(duration * rate) + 1) / rate
-    speed = base * np.arange(1, sines.shape[1] + 1)
-    sin, cos = np.sin(np.outer(t, speed)), np.cos(np.outer(t, speed))
+    harmonics = np.arange(1, sines.shape[1] + 1)
+    speed = base * harmonics
+    phase = np.outer(t, speed)
+    sin, cos = np.sin(phase), np.cos(phase)
     q = np.asarray(centre) + sin @ sines.T + cos @ cosines.T
     v = (cos * speed) @ sines.T - (sin * speed) @ cosines.T
-    return Reference(t, q, v, -(sin * speed**2) @ sines.T - (cos * speed**2) @ cosines.T)
+    a = -(sin * speed**2) @ sines.T - (cos * speed**2) @ cosines.T
+    return Reference(t, q, v, a)
 
 
 def random_fourier(
@@ -58,23 +61,33 @@ def random_fourier(
         lower, upper, velocity: (n,) limits, kept everywhere on the grid of `rate`.
         acceleration: largest in any joint.
     """
-    lower, upper, velocity = (np.asarray(x, dtype=float) for x in (lower, upper, velocity))
-    rng, n = np.random.default_rng(seed), len(lower)
+    lower = np.asarray(lower, dtype=float)
+    upper = np.asarray(upper, dtype=float)
+    velocity = np.asarray(velocity, dtype=float)
+    rng = np.random.default_rng(seed)
+    n = len(lower)
     order = np.arange(1, harmonics + 1)
     sines, cosines = rng.normal(size=(2, n, harmonics)) / order
-    for rows, across in ((sines, order), (cosines, order**2)):
-        rows -= np.outer(rows @ across, across) / (across @ across)
+    # at rest at both ends
+    _project_out(sines, order)
+    _project_out(cosines, order**2)
     base = 2 * np.pi / duration
     raw = _fourier(np.zeros(n), sines, cosines, base, duration, rate)
     low, high = raw.q.min(axis=0), raw.q.max(axis=0)
-    shares = [
-        (upper - lower) / (high - low),
-        velocity / np.abs(raw.v).max(axis=0),
-        acceleration / np.abs(raw.a).max(axis=0),
-    ]
-    scale = np.min(shares, axis=0)
+    # how far each joint may be scaled up before it meets each of its limits
+    travel_share = (upper - lower) / (high - low)
+    velocity_share = velocity / np.abs(raw.v).max(axis=0)
+    acceleration_share = acceleration / np.abs(raw.a).max(axis=0)
+    scale = np.min([travel_share, velocity_share, acceleration_share], axis=0)
     centre = 0.5 * (lower + upper) - 0.5 * scale * (low + high)
-    return _fourier(centre, scale[:, None] * sines, scale[:, None] * cosines, base, duration, rate)
+    amplitude = scale[:, None]
+    return _fourier(centre, amplitude * sines, amplitude * cosines, base, duration, rate)
+
+
+def _project_out(coefficients: np.ndarray, direction: np.ndarray) -> None:
+    """Remove the part along `direction` (h,) from each row of `coefficients` (n, h), in place."""
+    along = coefficients @ direction
+    coefficients -= np.outer(along, direction) / (direction @ direction)
 
 
 def trapezoidal(
@@ -90,34 +103,47 @@ def trapezoidal(
         pause: at rest after every move and before the first [s].
     """
     points = shaped(points, (None, None), "points")
-    velocity, acceleration = (
-        np.broadcast_to(np.asarray(x, dtype=float), points.shape[1]) for x in (velocity, acceleration)
-    )
-    still = np.zeros((round(pause * rate), points.shape[1]))
-    parts = [(still + points[0], still, still)]
+    n = points.shape[1]
+    velocity = np.broadcast_to(np.asarray(velocity, dtype=float), n)
+    acceleration = np.broadcast_to(np.asarray(acceleration, dtype=float), n)
+    still = np.zeros((round(pause * rate), n))
+    positions, velocities, accelerations = [still + points[0]], [still], [still]
     for start, stop in pairwise(points):
-        parts += [_move(start, stop, velocity, acceleration, rate), (still + stop, still, still)]
-    q, v, a = (np.concatenate(series) for series in zip(*parts))
-    return Reference(np.arange(len(q)) / rate, q, v, a)
+        q, v, a = _move(start, stop, velocity, acceleration, rate)
+        positions += [q, still + stop]
+        velocities += [v, still]
+        accelerations += [a, still]
+    q = np.concatenate(positions)
+    t = np.arange(len(q)) / rate
+    return Reference(t, q, np.concatenate(velocities), np.concatenate(accelerations))
 
 
-def _move(start, stop, velocity, acceleration, rate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _move(
+    start: np.ndarray, stop: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, rate: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return one move with s(t) from 0 to 1: ramps of r seconds, T seconds in all, peak velocity 1 / (T - r)."""
     distance = np.abs(stop - start)
-    ramp = float(np.max(velocity / acceleration, where=distance > 0, initial=1.0 / rate))
-    cruise = max(float(np.max(distance / velocity)), float(np.max(distance / acceleration)) / ramp)
+    ramp_times = velocity / acceleration
+    ramp = float(np.max(ramp_times, where=distance > 0, initial=1.0 / rate))
+    cruise_at_velocity = float(np.max(distance / velocity))
+    cruise_at_acceleration = float(np.max(distance / acceleration)) / ramp
+    cruise = max(cruise_at_velocity, cruise_at_acceleration)
     ramp = max(ramp, 2.0 / rate)
     total = max(cruise, ramp) + ramp
     t = np.arange(1, int(np.ceil(total * rate)) + 1) / rate
-    peak, remaining = 1.0 / (total - ramp), np.maximum(total - t, 0.0)
-    s = np.where(
-        t < ramp,
-        0.5 * peak * t**2 / ramp,
-        np.where(remaining < ramp, 1 - 0.5 * peak * remaining**2 / ramp, peak * (t - ramp / 2)),
-    )
-    speed = np.where(t < ramp, peak * t / ramp, np.where(remaining < ramp, peak * remaining / ramp, peak))
-    change = np.where(t < ramp, peak / ramp, np.where((remaining < ramp) & (remaining > 0), -peak / ramp, 0.0))
-    return start + np.outer(s, stop - start), np.outer(speed, stop - start), np.outer(change, stop - start)
+    peak = 1.0 / (total - ramp)
+    remaining = np.maximum(total - t, 0.0)
+    starting = t < ramp
+    stopping = remaining < ramp
+    # share of the way, its speed and its acceleration: without the ramp at the start, then with it
+    share = np.where(stopping, 1 - 0.5 * peak * remaining**2 / ramp, peak * (t - ramp / 2))
+    share = np.where(starting, 0.5 * peak * t**2 / ramp, share)
+    speed = np.where(stopping, peak * remaining / ramp, peak)
+    speed = np.where(starting, peak * t / ramp, speed)
+    change = np.where(stopping & (remaining > 0), -peak / ramp, 0.0)
+    change = np.where(starting, peak / ramp, change)
+    distances = stop - start
+    return start + np.outer(share, distances), np.outer(speed, distances), np.outer(change, distances)
 
 
 SIDED = ("Ia", "Fvl", "Fcl", "offl", "Fvm", "Fcm", "offm")  # drive terms of a joint with a torque sensor
@@ -136,29 +162,37 @@ def plant(name: str, coupled: bool = False, offset: np.ndarray | None = None) ->
         coupled: with the TX40's wrist coupling: Ia6 on both rows, Fvm6, Fcm6.
         offset: (n,) torque offsets, terms ``off1`` …; None for none.
     """
-    chain, true_values = description.read(library.path(name)), truth(name)
-    drive_terms = "Ia Fv Fc" if offset is None else "Ia Fv Fc off"
-    values = {key: true_values["drives"][key] for key in ("Ia", "Fv", "Fc")}
-    values["off"] = np.zeros(chain.n) if offset is None else offset
-    terms = list(drives.standard([drive_terms] * chain.n, true_values["drives"]["v0"]))
-    amounts = [values[key][joint] for joint in range(chain.n) for key in drive_terms.split()]
+    chain = description.read(library.path(name))
+    true_values = truth(name)
+    drive_rows = true_values["drives"]
+    shapes = ["Ia", "Fv", "Fc"]
+    if offset is not None:
+        shapes.append("off")
+    rows = {**drive_rows, "off": offset}
+    amounts = []
+    for joint in range(chain.n):
+        amounts += [rows[shape][joint] for shape in shapes]
+    terms = list(drives.standard([" ".join(shapes)] * chain.n, drive_rows["v0"]))
     if coupled:
-        link = true_values["coupling"]
-        first, second = (joint - 1 for joint in link["joints"])
-        gear = drives.coupled(first, second, true_values["drives"]["v0"])
-        coupled_index = next(k for k, term in enumerate(terms) if term.shape == "acceleration" and term.joint == second)
+        coupling = true_values["coupling"]
+        first, second = (joint - 1 for joint in coupling["joints"])
         # one motor inertia: Iam6 is Ia6, which acts on row 5 by a6 and on row 6 by a5 + a6
         both_rows = ((first, ((second, 1.0),)), (second, ((first, 1.0), (second, 1.0))))
-        terms[coupled_index] = replace(terms[coupled_index], acts=both_rows)
+        for k, term in enumerate(terms):
+            if term.shape == "acceleration" and term.joint == second:
+                terms[k] = replace(term, acts=both_rows)
+        gear = drives.coupled(first, second, drive_rows["v0"])
         terms += gear[1:]
-        amounts += [link["Fvm"], link["Fcm"]]
-    return Plant(bodies_of(chain), tuple(terms), np.concatenate([standard_parameters(chain), amounts]))
+        amounts += [coupling["Fvm"], coupling["Fcm"]]
+    parameters = np.concatenate([standard_parameters(chain), amounts])
+    return Plant(bodies_of(chain), tuple(terms), parameters)
 
 
 def controller(name: str) -> LoopController:
     """Return the published PD controller of the TX40 or RV-2SQ."""
     gains = truth(name)["control"]
-    return pd(np.array(gains["kp"]), np.array(gains["kd"]), np.array(gains.get("limit", np.inf)))
+    limit = np.array(gains.get("limit", np.inf))
+    return pd(np.array(gains["kp"]), np.array(gains["kd"]), limit)
 
 
 def model(plant: Plant) -> IdentificationModel:

@@ -15,16 +15,20 @@ from calib.robot.kinematics import forward, joint_jacobian, sweep
 from calib.transforms import invert, pose
 
 COLUMNS = ("alpha", "d", "theta", "r")
-TABLE_3 = {
-    "nominal": {"position_mm": {"max": 9.6806, "mean": 5.9019}, "orientation_deg": {"max": 0.8058, "mean": 0.5636}},
-    "calibrated": {"position_mm": {"max": 1.7592, "mean": 0.7965}, "orientation_deg": {"max": 0.2268, "mean": 0.1042}},
-}
+NOMINAL_ERRORS = {"position_mm": {"max": 9.6806, "mean": 5.9019}, "orientation_deg": {"max": 0.8058, "mean": 0.5636}}
+CALIBRATED_ERRORS = {"position_mm": {"max": 1.7592, "mean": 0.7965}, "orientation_deg": {"max": 0.2268, "mean": 0.1042}}
+TABLE_3 = {"nominal": NOMINAL_ERRORS, "calibrated": CALIBRATED_ERRORS}
 POSES, BASE_PARAMETERS, CONDITION = 17, 32, 11.1878
+# frames moved by joints 2 to 7, whose rows of Table 2 the library's arm has
+ARM_FRAMES = range(2, 8)
+# of the paper's Table 1: joint limits [rad]
+JOINT_LIMITS = np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 90.0, 170.0])
 
 
 def transform(alpha: float, d: float, theta: float, r: float) -> np.ndarray:
     """Return Rot_x(alpha) Trans_x(d) Rot_z(theta) Trans_z(r), (4, 4)."""
-    about_x, about_z = Rotation.from_euler("x", alpha), Rotation.from_euler("z", theta)
+    about_x = Rotation.from_euler("x", alpha)
+    about_z = Rotation.from_euler("z", theta)
     return pose(about_x, [d, 0.0, 0.0]) @ pose(about_z, [0.0, 0.0, r])
 
 
@@ -42,7 +46,10 @@ def nominal_chain() -> Chain:
 
 def arm(table: np.ndarray) -> Chain:
     """Return the library's arm with the values of frames 2 to 7 of a table (9, 4)."""
-    values = {f"{column}{row}": table[row, position] for row in range(2, 8) for position, column in enumerate(COLUMNS)}
+    values = {}
+    for frame in ARM_FRAMES:
+        for column, value in zip(COLUMNS, table[frame]):
+            values[f"{column}{frame}"] = value
     return nominal_chain().with_values(values)
 
 
@@ -65,12 +72,20 @@ def constraint_values(chain: Chain, station: np.ndarray, tool: np.ndarray, q: np
     fixture = forward(chain, q) @ tool
     rotation = station[:3, :3] @ fixture[:, :3, :3]
     roll = np.arctan2(rotation[:, 2, 1], rotation[:, 2, 2])
-    pitch = np.arctan2(-rotation[:, 2, 0], np.hypot(rotation[:, 0, 0], rotation[:, 1, 0]))
-    across = np.hypot(fixture[:, 0, 3], fixture[:, 1, 3])
-    height = fixture[:, 2, 3] + 0.31
-    return np.column_stack(
-        [roll + 4 * np.pi / 9, 7 * np.pi / 18 - roll, pitch + np.pi / 4, np.pi / 4 - pitch, across - 0.2, height + 0.1]
-    )
+    cosine_of_pitch = np.hypot(rotation[:, 0, 0], rotation[:, 1, 0])
+    pitch = np.arctan2(-rotation[:, 2, 0], cosine_of_pitch)
+    x, y, z = fixture[:, :3, 3].T
+    across = np.hypot(x, y)
+    height = z + 0.31
+    values = [
+        roll + 4 * np.pi / 9,
+        7 * np.pi / 18 - roll,
+        pitch + np.pi / 4,
+        np.pi / 4 - pitch,
+        across - 0.2,
+        height + 0.1,
+    ]
+    return np.column_stack(values)
 
 
 def constraint_gradients(chain: Chain, station: np.ndarray, tool: np.ndarray, q: np.ndarray) -> np.ndarray:
@@ -81,19 +96,25 @@ def constraint_gradients(chain: Chain, station: np.ndarray, tool: np.ndarray, q:
     """
     walked = sweep(chain, q)
     fixture = walked.poses() @ tool
-    slope = joint_jacobian(chain, walked, fixture[:, :3, 3].T)
-    across = fixture[:, :2, 3] / np.maximum(np.hypot(fixture[:, 0, 3], fixture[:, 1, 3]), 1e-9)[:, None]
-    turn = station[:3, :3] @ slope[:, 3:]
-    x, y = (station[:3, :3] @ fixture[:, :3, 0].T)[:2, :, None]
+    position = fixture[:, :3, 3]
+    slope = joint_jacobian(chain, walked, position.T)
+    # direction (m, 2) from axis 1 to the fixture
+    distance = np.maximum(np.hypot(position[:, 0], position[:, 1]), 1e-9)
+    across = position[:, :2] / distance[:, None]
+    away = np.einsum("mi,min->mn", across, slope[:, :2])
+    rotation = station[:3, :3]
+    turn = rotation @ slope[:, 3:]
+    fixture_axis = rotation @ fixture[:, :3, 0].T
+    x, y = fixture_axis[:2, :, None]
     cosine = np.maximum(np.hypot(x, y), 1e-9)
     roll = (x * turn[:, 0] + y * turn[:, 1]) / cosine**2
     pitch = (x * turn[:, 1] - y * turn[:, 0]) / cosine
-    away = np.einsum("mi,min->mn", across, slope[:, :2])
     return np.stack([roll, -roll, pitch, -pitch, away, slope[:, 2]], axis=1)
 
 
 def feasible(chain: Chain, station: np.ndarray, tool: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return whether joint values q (m, 7) satisfy Table 1, joint limits included: (m,) bool."""
-    limits = np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 90.0, 170.0])
-    within = np.concatenate([limits - np.abs(q), constraint_values(chain, station, tool, q)], axis=1)
-    return np.all(within >= 0.0, axis=1)
+    in_limits = JOINT_LIMITS - np.abs(q)
+    constraints = constraint_values(chain, station, tool, q)
+    margins = np.concatenate([in_limits, constraints], axis=1)
+    return np.all(margins >= 0.0, axis=1)

@@ -17,9 +17,14 @@ from calib.data.images.board_print import raster
 from calib.data.images.lens import Lens, rays
 from calib.data.images.optics import BoardShape, shaped_points
 
-SUB = 3  # sub-pixels each way
-NODES = 16  # pixels between the nodes at which rays are computed; cubic in between
-PAPER = 0.02  # white margin around the pattern [m]
+# sub-pixels in each direction
+SUB = 3
+# pixels between the nodes at which rays are computed; cubic in between
+NODES = 16
+# white margin around the pattern [m]
+PAPER = 0.02
+# to meet a bent board with a ray
+BENT_ITERATIONS = 4
 
 
 @dataclass(frozen=True)
@@ -62,41 +67,53 @@ def render(
         seed: of the noise.
         shape: of the print: scale and bending.
     """
-    imaging, rng = imaging or Imaging(), np.random.default_rng(seed)
+    imaging = imaging or Imaging()
+    shape = shape or BoardShape()
+    rng = np.random.default_rng(seed)
+    width, height = lens.size
     exposure_poses = np.atleast_3d(poses.T).T.reshape(-1, 4, 4)
-    image = np.zeros(lens.size[::-1], dtype=np.float32)
+    image = np.zeros((height, width), dtype=np.float32)
     for pose in exposure_poses:
-        image += _reflectance(board, lens, pose, imaging.background, shape or BoardShape()) / len(exposure_poses)
+        reflectance = _reflectance(board, lens, pose, imaging.background, shape)
+        image += reflectance / len(exposure_poses)
     if imaging.defocus > 0.0:
         image = cv2.GaussianBlur(image, (0, 0), imaging.defocus)
-    across = np.linspace(-0.5, 0.5, lens.size[0], dtype=np.float32)[None]
-    down = np.linspace(-0.5, 0.5, lens.size[1], dtype=np.float32)[:, None]
+    across = np.linspace(-0.5, 0.5, width, dtype=np.float32)[None]
+    down = np.linspace(-0.5, 0.5, height, dtype=np.float32)[:, None]
     light = 1.0 - imaging.uneven * (0.5 + 0.7 * across + 0.3 * down)
     grey = 255.0 * imaging.exposure * light * image
-    grey += rng.standard_normal(grey.shape, dtype=np.float32) * np.sqrt(imaging.read**2 + imaging.shot * grey)
+    noise_sigma = np.sqrt(imaging.read**2 + imaging.shot * grey)
+    grey += rng.standard_normal(grey.shape, dtype=np.float32) * noise_sigma
     return np.clip(np.round(grey), 0, 255).astype(np.uint8)
 
 
 def _reflectance(board: Board, lens: Lens, pose: np.ndarray, background: float, shape: BoardShape) -> np.ndarray:
     """Return the reflectance image (height, width) of one board pose, averaged over each pixel."""
     result = np.full(lens.size[::-1], background, dtype=np.float32)
-    outline = _outline(board)
-    outline_camera = shaped_points(board, shape, outline) @ pose[:3, :3].T + pose[:3, 3]
-    if np.any(outline_camera[:, 2] < 0.02):
+    outline = shaped_points(board, shape, _outline(board))
+    outline_camera = outline @ pose[:3, :3].T + pose[:3, 3]
+    depth = outline_camera[:, 2]
+    if np.any(depth < 0.02):
         return result
+    # window of the image that the paper fills
     pixel = lens.project(outline_camera)
     low = np.maximum(np.floor(pixel.min(axis=0)) - 2, 0).astype(int)
     high = np.minimum(np.ceil(pixel.max(axis=0)) + 3, lens.size).astype(int)
     if np.any(high <= low):
         return result
-    scale = SUB * float(np.max(lens.values[:2]) / outline_camera[:, 2].min())
+    # drawing of the board that is at least as fine as the sub-pixels
+    scale = SUB * float(np.max(lens.values[:2]) / depth.min())
     level = int(np.ceil(np.log(scale) / np.log(1.25)))
-    sheet, per_metre = _sheet_at(board, level), 1.25**level
+    per_metre = 1.25**level
+    sheet = _sheet_at(board, level)
     board_points = _on_sheet(board, lens, pose, shape, low, high)
-    x, y = (((board_points[:, :, axis] + PAPER) * per_metre - 0.5).astype(np.float32) for axis in (0, 1))
+    sheet_pixels = ((board_points + PAPER) * per_metre - 0.5).astype(np.float32)
+    x = np.ascontiguousarray(sheet_pixels[:, :, 0])
+    y = np.ascontiguousarray(sheet_pixels[:, :, 1])
     fine = cv2.remap(sheet, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=background)
-    size = high - low
-    result[low[1] : high[1], low[0] : high[0]] = cv2.resize(fine, tuple(size.tolist()), interpolation=cv2.INTER_AREA)
+    size = tuple((high - low).tolist())
+    window = (slice(low[1], high[1]), slice(low[0], high[0]))
+    result[window] = cv2.resize(fine, size, interpolation=cv2.INTER_AREA)
     return result
 
 
@@ -108,35 +125,57 @@ def _sheet_at(board: Board, level: int) -> np.ndarray:
 def _outline(board: Board) -> np.ndarray:
     """Return points (N, 3) [m] along the edge of the paper."""
     width, height = board.extent
-    x, y = np.linspace(-PAPER, width + PAPER, 9), np.linspace(-PAPER, height + PAPER, 9)
-    edge = [(a, b) for a in x for b in (y[0], y[-1])] + [(a, b) for a in (x[0], x[-1]) for b in y]
-    return np.column_stack([np.array(edge), np.zeros(len(edge))])
+    x = np.linspace(-PAPER, width + PAPER, 9)
+    y = np.linspace(-PAPER, height + PAPER, 9)
+    edge = []
+    for along in x:
+        edge += [(along, y[0]), (along, y[-1])]
+    for side in (x[0], x[-1]):
+        edge += [(side, along) for along in y]
+    heights = np.zeros(len(edge))
+    return np.column_stack([np.array(edge), heights])
 
 
 def _on_sheet(
     board: Board, lens: Lens, pose: np.ndarray, shape: BoardShape, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
     """Return the board points (h·SUB, w·SUB, 2) [m] seen by the sub-pixels of an image window."""
-    knots = [np.arange(a - NODES, b + 2 * NODES, NODES, dtype=float) for a, b in zip(low, high)]
-    grid = np.stack(np.meshgrid(*knots), axis=-1)
-    ray = np.concatenate([rays(lens, grid.reshape(-1, 2)), np.ones((grid[..., 0].size, 1))], axis=1)
-    normal, turned = pose[:3, 2], pose[:3, :3]
+    # rays through nodes around the window
+    columns = np.arange(low[0] - NODES, high[0] + 2 * NODES, NODES, dtype=float)
+    rows = np.arange(low[1] - NODES, high[1] + 2 * NODES, NODES, dtype=float)
+    grid = np.stack(np.meshgrid(columns, rows), axis=-1)
+    direction = rays(lens, grid.reshape(-1, 2))
+    ray = np.column_stack([direction, np.ones(len(direction))])
+    # where they meet the sheet; a bent one is met by iteration
+    turn, position = pose[:3, :3], pose[:3, 3]
+    normal = pose[:3, 2]
     hit = np.zeros((len(ray), 2))
-    for _ in range(4 if shape.bent else 1):
-        rise = shaped_points(board, shape, np.column_stack([hit, np.zeros(len(hit))]))[:, 2]
-        depth = (normal @ pose[:3, 3] + rise) / (ray @ normal)
-        hit = ((ray * depth[:, None] - pose[:3, 3]) @ turned)[:, :2] / shape.scale
-    nodes = hit.reshape(grid.shape).astype(np.float32)  # 1e-4 px
-    down, across = (_cubic(count, len(line)) for count, line in zip((high - low)[::-1], knots[::-1]))
-    return np.stack([down @ nodes[:, :, k] @ across.T for k in (0, 1)], axis=-1)
+    for _ in range(BENT_ITERATIONS if shape.bent else 1):
+        flat = np.column_stack([hit, np.zeros(len(hit))])
+        rise = shaped_points(board, shape, flat)[:, 2]
+        depth = (normal @ position + rise) / (ray @ normal)
+        on_board = (ray * depth[:, None] - position) @ turn
+        hit = on_board[:, :2] / shape.scale
+    # single precision is 1e-4 px
+    nodes = hit.reshape(grid.shape).astype(np.float32)
+    width, height = high - low
+    down = _cubic(height, len(rows))
+    across = _cubic(width, len(columns))
+    x = down @ nodes[:, :, 0] @ across.T
+    y = down @ nodes[:, :, 1] @ across.T
+    return np.stack([x, y], axis=-1)
 
 
 def _cubic(count: int, columns: int) -> np.ndarray:
     """Return the matrix that interpolates from nodes to the sub-pixels of `count` pixels (Catmull & Rom 1974)."""
-    at = (np.arange(count * SUB) + 0.5) / SUB - 0.5 + NODES  # pixels after the first node
-    first, t = np.divmod(at / NODES, 1.0)
-    result = np.zeros((len(at), columns), dtype=np.float32)
-    weights = [-t * (1 - t) ** 2, 2 - 5 * t**2 + 3 * t**3, t * (1 + 4 * t - 3 * t**2), -(t**2) * (1 - t)]
-    for offset, weight in zip((-1, 0, 1, 2), weights):
-        result[np.arange(len(at)), first.astype(int) + offset] += 0.5 * weight
+    # pixels after the first node
+    position = (np.arange(count * SUB) + 0.5) / SUB - 0.5 + NODES
+    first, t = np.divmod(position / NODES, 1.0)
+    node = first.astype(int)
+    row = np.arange(len(position))
+    result = np.zeros((len(position), columns), dtype=np.float32)
+    result[row, node - 1] += 0.5 * (-t * (1 - t) ** 2)
+    result[row, node] += 0.5 * (2 - 5 * t**2 + 3 * t**3)
+    result[row, node + 1] += 0.5 * (t * (1 + 4 * t - 3 * t**2))
+    result[row, node + 2] += 0.5 * (-(t**2) * (1 - t))
     return result

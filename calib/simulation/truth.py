@@ -23,8 +23,12 @@ from calib.simulation.unmodelled import WARM_TIME
 from calib.simulation.virtual_arm import MovingArm
 from calib.transforms import to_quaternion
 
-TRUTH = 2000  # poses over the whole joint range
-SECONDS, RATE = 20.0, 250.0  # of the motion nobody has seen [s], [Hz]
+# number of poses over the whole joint range
+TRUTH = 2000
+# of the validation motion [s], [Hz]
+SECONDS, RATE = 20.0, 250.0
+# of joints without a stated limit [rad/s or m/s]
+DEFAULT_SPEED = 2.0
 
 
 def position_errors(cell: Cell, calibrated: Installation, urdf: Chain) -> tuple[float, float, float]:
@@ -47,15 +51,21 @@ def position_errors(cell: Cell, calibrated: Installation, urdf: Chain) -> tuple[
         station=calibrated.station_names[0],
         tool_names=calibrated.tool_names[:1],
     )
-    nominal, urdf_cell = (polish_frames(install(chain, [block]), [block]).cell for chain in (cell.nominal, urdf))
-    before, after, bare = (_rms(arm, block) for arm in (nominal, calibrated, urdf_cell))
-    return before, after, bare
+    return _rms(_placed(cell.nominal, block), block), _rms(calibrated, block), _rms(_placed(urdf, block), block)
+
+
+def _placed(chain: Chain, block: Poses) -> Installation:
+    """Return an arm with its best station and tool for the poses of a block."""
+    guess = install(chain, [block])
+    return polish_frames(guess, [block]).cell
 
 
 def _rms(arm: Installation, block: Poses) -> float:
+    """Return the rms position error [mm] of an arm at the poses of a block."""
     reference = arm.deflection.reference or arm.chain
-    torque = None if reference.inertias is None else gravity_torques(reference, block.q)
-    return 1e3 * errors(arm, [replace(block, torque=torque)]).rms
+    if reference.inertias is not None:
+        block = replace(block, torque=gravity_torques(reference, block.q))
+    return 1e3 * errors(arm, [block]).rms
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,21 +95,31 @@ def torque_errors(
         seed: of the motion.
     """
     lower, upper = chain.sampling_limits()
-    speed = np.array([joint.velocity if np.isfinite(joint.velocity) else 2.0 for joint in chain.joints])
+    speed = np.array([joint.velocity for joint in chain.joints])
+    speed = np.where(np.isfinite(speed), speed, DEFAULT_SPEED)
     motion = random_fourier(0.8 * lower, 0.8 * upper, 0.8 * speed, SECONDS, RATE, seed=seed)
     states = (motion.q, motion.v, motion.a)
-    motor, link = arm.true_torque(*states), arm.link_torque(*states)
+    motor = arm.true_torque(*states)
+    link = arm.link_torque(*states)
     true = model.torque_rows.target(motor, link, motion.q, motion.v)
+
     load = model.transmitted(values, *states, ())
-    predicted = np.einsum("kij,j->ki", model.regressor(*states, load, ()), values)
-    friction = link - inverse_dynamics(arm.plant.bodies, arm.plant.parameters[: arm.plant.inertial], *states)
-    nominal = inverse_dynamics(bodies_of(cell.nominal), standard_parameters(cell.nominal), *states) + friction
+    regressor = model.regressor(*states, load, ())
+    predicted = np.einsum("kij,j->ki", regressor, values)
     error = predicted - true
-    return TorqueComparison(_percent(error, true), np.sqrt(np.mean(error**2, axis=0)), _percent(nominal - link, link))
+
+    plant = arm.plant
+    friction = link - inverse_dynamics(plant.bodies, plant.parameters[: plant.inertial], *states)
+    nominal_bodies = bodies_of(cell.nominal)
+    nominal = inverse_dynamics(nominal_bodies, standard_parameters(cell.nominal), *states) + friction
+    joint_rms = np.sqrt(np.mean(error**2, axis=0))
+    return TorqueComparison(_percent(error, true), joint_rms, _percent(nominal - link, link))
 
 
-def _percent(error: np.ndarray, size: np.ndarray) -> float:
-    return float(100.0 * np.linalg.norm(error) / np.linalg.norm(size))
+def _percent(error: np.ndarray, torque: np.ndarray) -> float:
+    """Return 100 ‖error‖ / ‖torque‖ [%]."""
+    share = 100.0 * np.linalg.norm(error) / np.linalg.norm(torque)
+    return float(share)
 
 
 def share_within(true: Mapping[str, float], estimate: Sequence[EstimateRow]) -> tuple[float, int]:
@@ -109,9 +129,14 @@ def share_within(true: Mapping[str, float], estimate: Sequence[EstimateRow]) -> 
         true: values by name, as `true_base` returns; parameters without one, or without sigma, are not counted.
         estimate: with sigmas; an R behind a name (regrouped) is not part of it.
     """
-    rows = [(true[name], row) for row in estimate if (name := row.name.removesuffix("R")) in true]
-    within = [abs(row.value - value) < 2 * row.sigma for value, row in rows if row.sigma]
-    return (float(np.mean(within)) if within else 0.0), len(within)
+    within = []
+    for row in estimate:
+        name = row.name.removesuffix("R")
+        if name in true and row.sigma:
+            within.append(abs(row.value - true[name]) < 2 * row.sigma)
+    if not within:
+        return 0.0, 0
+    return float(np.mean(within)), len(within)
 
 
 def true_base(
@@ -122,20 +147,31 @@ def true_base(
     Friction is that of an arm in steady sliding that has moved for the time `running` [s], infinite for a warm one:
     friction with memory, all of it slipping, is Coulomb friction.
     """
-    warming = arm.unmodelled.warming * (1.0 - np.exp(-running / WARM_TIME))
-    parameters = dict(zip((*arm.plant.bodies.names, *(term.name for term in arm.plant.terms)), arm.plant.parameters))
-    for j in range(arm.chain.n):
-        for name, change in (("Fv", 0.0), ("Fc", arm.unmodelled.memory)):
-            parameters[f"{name}m{j + 1}"] += (change - warming) * (
-                parameters[f"{name}l{j + 1}"] + parameters[f"{name}m{j + 1}"]
-            )
-        for name in ("Fv", "Fc", "off"):  # whole drives, where the model does not part motor and link
-            parameters[f"{name}{j + 1}"] = parameters[f"{name}l{j + 1}"] + parameters[f"{name}m{j + 1}"]
-    names = tuple(name for name in model.names if name in parameters)
+    parameters = _true_parameters(arm, running)
+    names = {name for name in model.names if name in parameters}
     terms = tuple(term for term in model.terms if term.name in names)
-    bare = [replace(model, bodies=bodies_of(chain), terms=terms) for chain in (cell.nominal, arm.chain)]
+    nominal_model = replace(model, bodies=bodies_of(cell.nominal), terms=terms)
+    true_model = replace(model, bodies=bodies_of(arm.chain), terms=terms)
     lower, upper = arm.chain.sampling_limits()
-    samples = bases.random_samples(bare[0], seed=seed, lower=lower, upper=upper)
-    base = bases.find(bare[1], samples, nominal=bare[0])
-    plain = (base.standard[k] for k in base.kept)  # what is regrouped on one geometry need not be on another
-    return dict(zip(plain, base.transform @ np.array([parameters[name] for name in bare[1].names])))
+    samples = bases.random_samples(nominal_model, seed=seed, lower=lower, upper=upper)
+    base = bases.find(true_model, samples, nominal=nominal_model)
+    values = np.array([parameters[name] for name in true_model.names])
+    # what is regrouped on one geometry need not be on another: named without the R
+    base_names = [base.standard[column] for column in base.kept]
+    return dict(zip(base_names, base.transform @ values))
+
+
+def _true_parameters(arm: MovingArm, running: float) -> dict[str, float]:
+    """Return the true standard parameters of an arm by name; those of whole drives, and of link and motor side."""
+    plant = arm.plant
+    names = [*plant.bodies.names, *(term.name for term in plant.terms)]
+    parameters = dict(zip(names, plant.parameters))
+    warming = arm.unmodelled.warming * (1.0 - np.exp(-running / WARM_TIME))
+    for number in range(1, arm.chain.n + 1):
+        for name, change in (("Fv", 0.0), ("Fc", arm.unmodelled.memory)):
+            link, motor = f"{name}l{number}", f"{name}m{number}"
+            parameters[motor] += (change - warming) * (parameters[link] + parameters[motor])
+        # of whole drives, for models that do not separate motor and link
+        for name in ("Fv", "Fc", "off"):
+            parameters[f"{name}{number}"] = parameters[f"{name}l{number}"] + parameters[f"{name}m{number}"]
+    return parameters

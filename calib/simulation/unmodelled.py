@@ -26,16 +26,23 @@ import numpy as np
 from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import gravity_torques
 
-WARM_POSES, WARM_TIME = 30.0, 120.0  # i_0 [poses], t_0 [s]
-WIDTHS = (2e-3, 8e-3, 30e-3)  # s_k [rad or m]
-TEETH = 100  # N
-CABLE = 0.5  # [rad]
+# i_0 [poses], t_0 [s]
+WARM_POSES, WARM_TIME = 30.0, 120.0
+# s_k [rad or m]
+WIDTHS = (2e-3, 8e-3, 30e-3)
+# N
+TEETH = 100
+# of the cable's spring [rad]
+CABLE = 0.5
+# size of the gear errors of a prismatic joint, in m, per rad of a revolute one
+PRISMATIC_SHARE = 0.3
 
 
-def _named(effects: Sequence[tuple[float, str]]) -> str:
-    """Return the names of all effects with a size above 0, as the end of a sentence; empty without any."""
-    names = ", ".join(description for size, description in effects if size)
-    return f"; unmodelled: {names}" if names else ""
+def _named(effects: Sequence[str]) -> str:
+    """Return the names of effects as the end of a sentence; empty without any."""
+    if not effects:
+        return ""
+    return f"; unmodelled: {', '.join(effects)}"
 
 
 @dataclass(frozen=True)
@@ -59,13 +66,16 @@ class PositionErrors:
     @property
     def note(self) -> str:
         """What they are, as the end of a sentence; empty where there are none."""
-        parts = [
-            (self.gear, f"gear errors of {self.gear * 1e3:.2g} mrad that depend on load and on the next joint"),
-            (self.backlash, f"backlash of ±{self.backlash * 1e3:.2g} mrad"),
-            (self.growth, f"lengths growing by {self.growth * 1e6:.0f} ppm"),
-            (self.droop, f"a tool drooping by up to {self.droop * 1e3:.2g} mm"),
-        ]
-        return _named(parts)
+        effects = []
+        if self.gear:
+            effects.append(f"gear errors of {self.gear * 1e3:.2g} mrad that depend on load and on the next joint")
+        if self.backlash:
+            effects.append(f"backlash of ±{self.backlash * 1e3:.2g} mrad")
+        if self.growth:
+            effects.append(f"lengths growing by {self.growth * 1e6:.0f} ppm")
+        if self.droop:
+            effects.append(f"a tool drooping by up to {self.droop * 1e3:.2g} mm")
+        return _named(effects)
 
 
 def displacements(
@@ -82,15 +92,23 @@ def displacements(
     """
     rng = np.random.default_rng([errors.seed, 11])
     phases = rng.uniform(0.0, 2.0 * np.pi, (2, chain.n))
-    joint_scale = np.array([1.0 if joint.kind == "revolute" else 0.3 for joint in chain.joints])
+    joint_scale = np.ones(chain.n)
+    for j, joint in enumerate(chain.joints):
+        if joint.kind != "revolute":
+            joint_scale[j] = PRISMATIC_SHARE
     next_joint = q[:, (np.arange(chain.n) + 1) % chain.n]
     load = torque / _largest_load(chain)
+    of_next_joint = np.sin(2.0 * q + next_joint + phases[0])
+    of_load = load * np.sin(3.0 * q + phases[1])
+    gear_error = errors.gear * (of_next_joint + of_load)
+    # the side from which a joint came
     side = np.sign(np.diff(q, axis=0, prepend=0.0))
-    gear_error = errors.gear * (np.sin(2.0 * q + next_joint + phases[0]) + load * np.sin(3.0 * q + phases[1]))
+    backlash = errors.backlash * side
     result = np.zeros((len(chain.elements), len(q)))
-    result[chain.moving] = (joint_scale * (gear_error - errors.backlash * side)).T
+    result[chain.moving] = (joint_scale * (gear_error - backlash)).T
     lengths = np.array([element.axis[0] == "t" for element in chain.elements])
-    heat = 1.0 - np.exp(-(warm + np.arange(len(q))) / WARM_POSES)
+    poses_before = warm + np.arange(len(q))
+    heat = 1.0 - np.exp(-poses_before / WARM_POSES)
     result[lengths] += errors.growth * np.outer(chain.values[lengths], heat)
     return result
 
@@ -99,7 +117,8 @@ def _largest_load(chain: Chain) -> np.ndarray:
     """Return the largest gravity torque (n,) [N m or N] of each joint; 1 for joints without gravity load."""
     if chain.inertias is None:
         return np.ones(chain.n)
-    largest = np.abs(gravity_torques(chain, random_joints(chain, 200, 0))).max(axis=0)
+    torques = gravity_torques(chain, random_joints(chain, 200, 0))
+    largest = np.abs(torques).max(axis=0)
     return np.where(largest > 1e-6, largest, 1.0)
 
 
@@ -111,10 +130,14 @@ def drooping(errors: PositionErrors, chain: Chain, poses: np.ndarray, base: np.n
         poses: (m, 4, 4) of the tool in the station's frame [m].
         base: (4, 4) of the arm's base in the station's frame.
     """
-    droop_direction = np.random.default_rng([errors.seed, 13]).uniform(0.2, 1.0, 3)
-    down = base[:3, :3] @ (chain.gravity / max(float(np.linalg.norm(chain.gravity)), 1e-9))
-    result, turn = poses.copy(), poses[:, :3, :3]
-    result[:, :3, 3] += errors.droop * np.einsum("mij,j,mkj,k->mi", turn, droop_direction, turn, down)
+    rng = np.random.default_rng([errors.seed, 13])
+    droop_direction = rng.uniform(0.2, 1.0, 3)
+    gravity = max(float(np.linalg.norm(chain.gravity)), 1e-9)
+    down = base[:3, :3] @ (chain.gravity / gravity)
+    turn = poses[:, :3, :3]
+    droop = np.einsum("mij,j,mkj,k->mi", turn, droop_direction, turn, down)
+    result = poses.copy()
+    result[:, :3, 3] += errors.droop * droop
     return result
 
 
@@ -139,14 +162,18 @@ class TorqueErrors:
     @property
     def note(self) -> str:
         """What they are, as the end of a sentence; empty where there are none."""
-        parts = [
-            (self.memory, f"friction hysteresis (presliding), {self.memory:.0%} of Fc"),
-            (self.warming, f"friction falling by {self.warming:.0%} as it warms up"),
-            (self.ripple, f"ripple of {self.ripple:.1%} of the torque"),
-            (self.cable, f"cables of {self.cable:.1%} of the limits"),
-            (self.push, f"pushes of {self.push:.1%} of the limits"),
-        ]
-        return _named(parts)
+        effects = []
+        if self.memory:
+            effects.append(f"friction hysteresis (presliding), {self.memory:.0%} of Fc")
+        if self.warming:
+            effects.append(f"friction falling by {self.warming:.0%} as it warms up")
+        if self.ripple:
+            effects.append(f"ripple of {self.ripple:.1%} of the torque")
+        if self.cable:
+            effects.append(f"cables of {self.cable:.1%} of the limits")
+        if self.push:
+            effects.append(f"pushes of {self.push:.1%} of the limits")
+        return _named(effects)
 
     def cable_torques(self, q: np.ndarray, effort: np.ndarray) -> np.ndarray:
         """Return the torques (N, n) of the cables at joint values q (N, n); `effort` (n,) are the limits [N m or N]."""
@@ -167,8 +194,12 @@ def gear_torques(
         t: (N,) since the arm was cold [s].
     """
     heat = (1.0 - np.exp(-t / WARM_TIME))[:, None]
-    slipping = memory(q, errors.memory * coulomb) if errors.memory else 0.0
-    return slipping - errors.warming * heat * friction + errors.ripple * drive * np.sin(TEETH * q)
+    slipping = 0.0
+    if errors.memory:
+        slipping = memory(q, errors.memory * coulomb)
+    warming = errors.warming * heat * friction
+    ripple = errors.ripple * drive * np.sin(TEETH * q)
+    return slipping - warming + ripple
 
 
 def memory(q: np.ndarray, sizes: np.ndarray) -> np.ndarray:
@@ -179,8 +210,10 @@ def memory(q: np.ndarray, sizes: np.ndarray) -> np.ndarray:
         sizes: (n,) torque where all elements slip [N m or N].
     """
     widths = np.array(WIDTHS)[:, None]
-    z, bent = np.zeros((len(WIDTHS), q.shape[1])), np.zeros_like(q)
-    for k, step in enumerate(np.diff(q, axis=0), start=1):
+    z = np.zeros((len(WIDTHS), q.shape[1]))
+    bent = np.zeros_like(q)
+    steps = np.diff(q, axis=0)
+    for k, step in enumerate(steps, start=1):
         z = np.minimum(np.maximum(z + step, -widths), widths)
         bent[k] = (z / widths).mean(axis=0)
     return sizes * bent

@@ -27,13 +27,22 @@ from calib.simulation import known_robots
 from calib.simulation.cell import Cell
 from calib.simulation.unmodelled import TorqueErrors, gear_torques
 
-STRETCH, SHIFT, MASS = 0.05, 6e-3, 0.04  # how wrong the maker's masses are, 1 sigma: shape, centre [m], mass
-BANDWIDTH, DAMPING, CUTOFF = 8.0, 0.8, 60.0  # of the joint controller, and of its measured speed's filter [Hz]
-KNOWN = 0.8  # share of the friction that the controller feeds forward
-SIGMA_Q, SIGMA_LINK, SIGMA_MOTOR = 1e-5, 0.003, 0.005  # encoders [rad]; torques as logged, of their limits (our choice)
-REST = 1.0  # at rest before and after a motion [s]
-UNMODELLED = TorqueErrors(memory=0.3, warming=0.1, ripple=0.005, cable=0.0005, push=0.001)  # our choice
-PUSH_BAND = 20.0  # [Hz]
+# how wrong the maker's masses are, 1 sigma: shape, centre [m], mass
+STRETCH, SHIFT, MASS = 0.05, 6e-3, 0.04
+# of the joint controller [Hz], [-], and of its measured speed's filter [Hz]
+BANDWIDTH, DAMPING, CUTOFF = 8.0, 0.8, 60.0
+# share of the friction that the controller feeds forward
+KNOWN = 0.8
+# noise of the encoders [rad]; of the torques as logged, as a share of their limits (our choice)
+SIGMA_Q, SIGMA_LINK, SIGMA_MOTOR = 1e-5, 0.003, 0.005
+# at rest before and after a motion [s]
+REST = 1.0
+# our choice
+UNMODELLED = TorqueErrors(memory=0.3, warming=0.1, ripple=0.005, cable=0.0005, push=0.001)
+# [Hz]
+PUSH_BAND = 20.0
+# of joints without a stated limit: speed [rad/s or m/s] and torque [N m or N]
+DEFAULT_SPEED, DEFAULT_EFFORT = 2.0, 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,32 +99,45 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors =
     rng = np.random.default_rng([seed, 71])
     inertias = np.array([_perturbed(row, rng) for row in nominal.inertias])
     chain = replace(cell.truth.chain, inertias=inertias)
-    effort = np.array([joint.effort if np.isfinite(joint.effort) else 100.0 for joint in chain.joints])
-    terms = drives.standard(
-        [" ".join(known_robots.SIDED)] * chain.n, linear=[j.kind == "prismatic" for j in chain.joints]
-    )
+    effort = np.array([joint.effort for joint in chain.joints])
+    effort = np.where(np.isfinite(effort), effort, DEFAULT_EFFORT)
+
+    drive_terms = " ".join(known_robots.SIDED)
+    prismatic = [joint.kind == "prismatic" for joint in chain.joints]
+    terms = tuple(drives.standard([drive_terms] * chain.n, linear=prismatic))
     values, source = _drives(robot, nominal, effort)
-    plant = Plant(bodies_of(chain), tuple(terms), np.concatenate([standard_parameters(chain), values.ravel()]))
-    share = np.array([KNOWN if name[:1] == "F" else 1.0 for name in known_robots.SIDED])
-    believed_parameters = np.concatenate([standard_parameters(nominal), (values * share).ravel()])
+    parameters = np.concatenate([standard_parameters(chain), values.ravel()])
+    plant = Plant(bodies_of(chain), terms, parameters)
+
+    # what the maker believes: the nominal masses and a part of the friction
+    believed_values = values.copy()
+    for column, name in enumerate(known_robots.SIDED):
+        if name.startswith("F"):
+            believed_values[:, column] *= KNOWN
+    believed_parameters = np.concatenate([standard_parameters(nominal), believed_values.ravel()])
+    believed = Plant(bodies_of(nominal), terms, believed_parameters)
     inertia = plant.inertia_diagonal(random_joints(chain, 200, 0))
     omega = 2 * np.pi * BANDWIDTH
+    gains = pd(omega**2 * inertia, 2 * DAMPING * omega * inertia)
+
     sensors = sensed(robot)
-    noise = f"{SIGMA_MOTOR:.1%} (motors) and {SIGMA_LINK:.1%} (sensors)" if sensors else f"{SIGMA_MOTOR:.1%}"
+    noise = f"{SIGMA_MOTOR:.1%}"
+    if sensors:
+        noise = f"{SIGMA_MOTOR:.1%} (motors) and {SIGMA_LINK:.1%} (sensors)"
     note = (
         f"masses off their nominal by {2 * MASS:.0%}, centres by {1e3 * SHIFT:g} mm (1 sigma); {source}; torque noise "
         f"{noise} of the limits{unmodelled.note}"
     )
     return MovingArm(
-        chain,
-        plant,
-        IdentificationModel(plant.bodies, plant.terms, LINK),
-        Plant(bodies_of(nominal), tuple(terms), believed_parameters),
-        replace(pd(omega**2 * inertia, 2 * DAMPING * omega * inertia), cutoff=CUTOFF),
-        effort,
-        note,
-        unmodelled,
-        sensors,
+        chain=chain,
+        plant=plant,
+        link=IdentificationModel(plant.bodies, plant.terms, LINK),
+        believed=believed,
+        gains=replace(gains, cutoff=CUTOFF),
+        effort=effort,
+        note=note,
+        unmodelled=unmodelled,
+        sensors=sensors,
     )
 
 
@@ -133,11 +155,15 @@ def play(t: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, repeats: in
     """
     rate = (len(t) - 1) / (t[-1] - t[0])
     still = np.zeros((round(REST * rate), q.shape[1]))
-    parts = []
-    for series, ends in ((q, (q[0], q[-1])), (v, (0.0, 0.0)), (a, (0.0, 0.0))):
-        repeated = np.tile(series[:-1], (repeats, 1))
-        parts.append(np.concatenate([still + ends[0], repeated, series[-1:], still + ends[1]]))
-    return Reference(np.arange(len(parts[0])) / rate, *parts)
+
+    def repeated(series: np.ndarray, start: np.ndarray, stop: np.ndarray) -> np.ndarray:
+        period = np.tile(series[:-1], (repeats, 1))
+        return np.concatenate([still + start, period, series[-1:], still + stop])
+
+    zero = np.zeros(q.shape[1])
+    positions = repeated(q, q[0], q[-1])
+    times = np.arange(len(positions)) / rate
+    return Reference(times, positions, repeated(v, zero, zero), repeated(a, zero, zero))
 
 
 def record(
@@ -155,14 +181,19 @@ def record(
         NotConverged: where the loop is unstable.
     """
     rng = np.random.default_rng(seed)
+    # the controller feeds forward the torques at low accelerations
     slow = replace(reference, a=0.0 * reference.a)
     controller = arm.gains.with_feedforward(feed_forward(arm.believed, slow))
     sensing = Sensing(SIGMA_Q, push=arm.unmodelled.push * arm.effort, push_band=PUSH_BAND)
     unmodelled = _unmodelled(arm, reference.q, reference.v, reference.a, running + reference.t)
     run = simulate(arm.plant, controller, reference, sensing, rng, push=-unmodelled)
-    noise = [sigma * arm.effort * rng.normal(size=run.q.shape) for sigma in (SIGMA_LINK, SIGMA_MOTOR)]
-    link = _held(arm.link_torque(run.q, run.v, run.a)) + noise[0] if arm.sensors else None
-    motor = _held(run.torque) + noise[1]
+    # both are drawn, with sensors or without, so that the motors' noise is the same
+    link_noise = SIGMA_LINK * arm.effort * rng.normal(size=run.q.shape)
+    motor_noise = SIGMA_MOTOR * arm.effort * rng.normal(size=run.q.shape)
+    motor = _held(run.torque) + motor_noise
+    link = None
+    if arm.sensors:
+        link = _held(arm.link_torque(run.q, run.v, run.a)) + link_noise
     return Recording(run.t, run.measured, motor, "torque", arm.chain.joint_names, tau_link=link)
 
 
@@ -185,31 +216,41 @@ def _modelled(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np
 
 def _unmodelled(arm: MovingArm, q: np.ndarray, v: np.ndarray, a: np.ndarray, t: np.ndarray) -> np.ndarray:
     """Return the torques (N, n) of unmodelled effects [N m or N]; t (N,) is the time since the cold start [s]."""
-    parameters = dict(zip((term.name for term in arm.plant.terms), arm.plant.parameters[arm.plant.inertial :]))
-    viscous, coulomb = (
-        np.array([parameters[f"{name}l{j + 1}"] + parameters[f"{name}m{j + 1}"] for j in range(arm.chain.n)])
-        for name in ("Fv", "Fc")
-    )
+    plant = arm.plant
+    names = [term.name for term in plant.terms]
+    parameters = dict(zip(names, plant.parameters[plant.inertial :]))
+    # friction of motor and link together
+    viscous = np.zeros(arm.chain.n)
+    coulomb = np.zeros(arm.chain.n)
+    for j in range(arm.chain.n):
+        viscous[j] = parameters[f"Fvl{j + 1}"] + parameters[f"Fvm{j + 1}"]
+        coulomb[j] = parameters[f"Fcl{j + 1}"] + parameters[f"Fcm{j + 1}"]
     friction = viscous * v + coulomb * np.sign(v)
-    drive = _modelled(arm, q, v, a) if arm.unmodelled.ripple else np.zeros_like(q)
+    drive = np.zeros_like(q)
+    if arm.unmodelled.ripple:
+        drive = _modelled(arm, q, v, a)
     gear_torque = gear_torques(arm.unmodelled, q, drive, coulomb, friction, t)
     return gear_torque + arm.unmodelled.cable_torques(q, arm.effort)
 
 
 def _drives(robot: str, chain: Chain, effort: np.ndarray) -> tuple[np.ndarray, str]:
     """Return the true drive parameters (n, 7) in the order of `SIDED`, and a note on their source."""
-    source = "drives as published for the type"
-    if library.path(f"{robot}_truth").exists():
+    if not library.path(f"{robot}_truth").exists():
+        speed = np.array([joint.velocity for joint in chain.joints])
+        speed = np.where(np.isfinite(speed), speed, DEFAULT_SPEED)
+        bare = Plant(bodies_of(chain), (), standard_parameters(chain))
+        inertia = bare.inertia_diagonal(random_joints(chain, 200, 0))
+        friction = 0.05 * effort
+        rows = {"Ia": 0.5 * inertia, "Fvm": friction / speed, "Fcm": friction}
+        source = "drives assumed from its limits"
+    else:
         rows = known_robots.truth(robot)["drives"]
         if "Fvl" not in rows:
             rows = {"Ia": rows["Ia"], "Fvm": rows["Fv"], "Fcm": rows["Fc"]}
-    else:
-        source = "drives assumed from its limits"
-        speed = np.array([joint.velocity if np.isfinite(joint.velocity) else 2.0 for joint in chain.joints])
-        bare = Plant(bodies_of(chain), (), standard_parameters(chain))
-        inertia = bare.inertia_diagonal(random_joints(chain, 200, 0))
-        rows = {"Ia": 0.5 * inertia, "Fvm": 0.05 * effort / speed, "Fcm": 0.05 * effort}
-    return np.column_stack([rows.get(name, np.zeros(chain.n)) for name in known_robots.SIDED]), source
+        source = "drives as published for the type"
+    zero = np.zeros(chain.n)
+    columns = [rows.get(name, zero) for name in known_robots.SIDED]
+    return np.column_stack(columns), source
 
 
 def _perturbed(parameters: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -217,7 +258,8 @@ def _perturbed(parameters: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
     T P Tᵀ of the pseudo-inertia P (`calib.dynamics.pseudo_inertia`) is positive definite where P is.
     """
-    turn = np.eye(4)
-    turn[:3, :3] += STRETCH * rng.standard_normal((3, 3))
-    turn[:3, 3] = SHIFT * rng.standard_normal(3)
-    return to_standard((1.0 + MASS * rng.standard_normal()) ** 2 * turn @ from_standard(parameters) @ turn.T)
+    transform = np.eye(4)
+    transform[:3, :3] += STRETCH * rng.standard_normal((3, 3))
+    transform[:3, 3] = SHIFT * rng.standard_normal(3)
+    mass_scale = (1.0 + MASS * rng.standard_normal()) ** 2
+    return to_standard(mass_scale * transform @ from_standard(parameters) @ transform.T)

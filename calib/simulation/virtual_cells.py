@@ -15,8 +15,18 @@ from calib.simulation.cell import Cell, SimulatedInstrument
 from calib.simulation.unmodelled import PositionErrors
 from calib.transforms import pose
 
+# of the gears' harmonics
 ORDERS = (2, 3)
-CMM, NO_ERRORS = SimulatedInstrument(), PositionErrors()
+CMM = SimulatedInstrument()
+NO_ERRORS = PositionErrors()
+# how far a made-up arm is from its nominal (1 sigma) [m], [rad], [rad]
+LENGTH, ANGLE, OFFSET = 0.3e-3, 0.5e-3, 3e-3
+# hidden part of the LWR4+ [rad/(N m)], [rad]
+COMPLIANCE, AMPLITUDE, HIDDEN_SEED = 2e-5, 6e-4, 2
+# share of it where `UNMODELLED` comes on top
+MODELLED = 0.7
+# our choice
+UNMODELLED = PositionErrors(gear=4e-4, backlash=5e-5, growth=5e-5, droop=5e-5, seed=2)
 
 
 def deflection(chain: Chain, compliance: np.ndarray, amplitude: np.ndarray, seed: int) -> Deflection:
@@ -28,22 +38,19 @@ def deflection(chain: Chain, compliance: np.ndarray, amplitude: np.ndarray, seed
         amplitude: (n,) of each harmonic [rad, or m for a prismatic joint].
         seed: of the phases φ.
     """
-    phases = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, (chain.n, len(ORDERS)))
+    rng = np.random.default_rng(seed)
+    phases = rng.uniform(0.0, 2.0 * np.pi, (chain.n, len(ORDERS)))
     terms, values = [], []
-    for j, k in enumerate(chain.moving):
-        name = chain.elements[k].name
+    for j, element_index in enumerate(chain.moving):
+        name = chain.elements[element_index].name
         terms.append(Term(name, "torque", j))
         values.append(compliance[j])
         for order, phase in zip(ORDERS, phases[j]):
-            terms += [Term(name, "sin", j, order), Term(name, "cos", j, order)]
-            values += [amplitude[j] * np.cos(phase), amplitude[j] * np.sin(phase)]
+            terms.append(Term(name, "sin", j, order))
+            values.append(amplitude[j] * np.cos(phase))
+            terms.append(Term(name, "cos", j, order))
+            values.append(amplitude[j] * np.sin(phase))
     return Deflection(tuple(terms), np.array(values), chain)
-
-
-LENGTH, ANGLE, OFFSET = 0.3e-3, 0.5e-3, 3e-3  # how far a made-up arm is from its nominal (1 sigma) [m], [rad], [rad]
-COMPLIANCE, AMPLITUDE, HIDDEN_SEED = 2e-5, 6e-4, 2  # hidden part of the LWR4+ [rad/(N m)], [rad]
-MODELLED = 0.7  # share of it where `UNMODELLED` comes on top
-UNMODELLED = PositionErrors(gear=4e-4, backlash=5e-5, growth=5e-5, droop=5e-5, seed=2)  # our choice
 
 
 def virtual_cell(robot: str = "lwr4plus", seed: int = 0, instrument: SimulatedInstrument = CMM) -> Cell:
@@ -56,7 +63,8 @@ def virtual_cell(robot: str = "lwr4plus", seed: int = 0, instrument: SimulatedIn
     """
     if robot == "lwr4plus":
         return lwr4plus_cell(instrument, MODELLED, UNMODELLED)
-    return perturbed_cell(load(robot), seed, instrument, unmodelled=replace(UNMODELLED, gear=0.2 * UNMODELLED.gear))
+    unmodelled = replace(UNMODELLED, gear=0.2 * UNMODELLED.gear)
+    return perturbed_cell(load(robot), seed, instrument, unmodelled=unmodelled)
 
 
 def lwr4plus_cell(
@@ -74,13 +82,12 @@ def lwr4plus_cell(
     """
     _, calibrated = lwr4plus.table_2()
     true = lwr4plus.arm(calibrated)
-    stiff = np.full(true.n, hidden * COMPLIANCE), np.full(true.n, hidden * AMPLITUDE)
-    truth = Installation(
-        true,
-        lwr4plus.station(calibrated)[None],
-        lwr4plus.tool(calibrated)[None],
-        deflection=deflection(true, *stiff, HIDDEN_SEED),
-    )
+    compliance = np.full(true.n, hidden * COMPLIANCE)
+    amplitude = np.full(true.n, hidden * AMPLITUDE)
+    station = lwr4plus.station(calibrated)
+    tool = lwr4plus.tool(calibrated)
+    hidden_deflection = deflection(true, compliance, amplitude, HIDDEN_SEED)
+    truth = Installation(true, station[None], tool[None], deflection=hidden_deflection)
     note = (
         "simulated LWR4+: truth = calibrated column of Table 2 of Kolyubin et al. (2019), plus joint deflections of "
         f"{hidden * COMPLIANCE * 1e6:g} µrad/(N m) and two harmonics of {hidden * AMPLITUDE * 1e3:g} mrad per joint"
@@ -110,14 +117,18 @@ def perturbed_cell(
     """
     rng = np.random.default_rng(seed)
     true = _perturbed(nominal, rng, size)
-    span = float(np.linalg.norm(forward(nominal, np.zeros((1, nominal.n)))[0, :3, 3])) + 0.5
-    amplitude = np.array([AMPLITUDE if joint.kind == "revolute" else 0.3 * AMPLITUDE for joint in true.joints])
-    truth = Installation(
-        true,
-        _random_pose(rng, 3.0 * span)[None],
-        _random_pose(rng, 0.12)[None],
-        deflection=deflection(true, np.full(true.n, hidden * COMPLIANCE), hidden * amplitude, seed),
-    )
+    zero_pose = forward(nominal, np.zeros((1, nominal.n)))[0]
+    span = float(np.linalg.norm(zero_pose[:3, 3])) + 0.5
+    station = _random_pose(rng, 3.0 * span)
+    tool = _random_pose(rng, 0.12)
+
+    compliance = np.full(true.n, hidden * COMPLIANCE)
+    amplitude = np.full(true.n, AMPLITUDE)
+    for j, joint in enumerate(true.joints):
+        if joint.kind != "revolute":
+            amplitude[j] = 0.3 * AMPLITUDE
+    hidden_deflection = deflection(true, compliance, hidden * amplitude, seed)
+    truth = Installation(true, station[None], tool[None], deflection=hidden_deflection)
     note = (
         f"simulated {nominal.name}: errors per element of {size * LENGTH * 1e3:g} mm or "
         f"{size * ANGLE * 1e3:g} mrad, joint offsets of {size * OFFSET * 1e3:g} mrad (1 sigma), plus hidden deflections"
@@ -129,16 +140,24 @@ def perturbed_cell(
 def _perturbed(chain: Chain, seed: int | np.random.Generator, size: float = 1.0) -> Chain:
     """Return the chain with normal random errors (`LENGTH`, `ANGLE`; `OFFSET` for joint offsets) in all elements."""
     rng = np.random.default_rng(seed)
-    spread = [
-        LENGTH if element.unit == "m" else OFFSET if element.joint is not None else ANGLE for element in chain.elements
-    ]
-    return chain.with_values(chain.values + size * np.array(spread) * rng.standard_normal(len(spread)))
+    sigmas = []
+    for element in chain.elements:
+        if element.unit == "m":
+            sigmas.append(LENGTH)
+        elif element.joint is not None:
+            sigmas.append(OFFSET)
+        else:
+            sigmas.append(ANGLE)
+    errors = size * np.array(sigmas) * rng.standard_normal(len(sigmas))
+    return chain.with_values(chain.values + errors)
 
 
 def rigid(cell: Cell) -> Cell:
     """Return the cell without hidden deflections and unmodelled errors."""
-    still = cell.truth.deflection.with_coefficients(np.zeros(len(cell.truth.deflection.terms)))
-    return replace(cell, truth=replace(cell.truth, deflection=still), unmodelled=NO_ERRORS)
+    zero = np.zeros(len(cell.truth.deflection.terms))
+    still = cell.truth.deflection.with_coefficients(zero)
+    truth = replace(cell.truth, deflection=still)
+    return replace(cell, truth=truth, unmodelled=NO_ERRORS)
 
 
 def _random_pose(rng: np.random.Generator, distance: float) -> np.ndarray:

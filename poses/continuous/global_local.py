@@ -41,8 +41,13 @@ def mlsl_search(
         evaluations: most of the index, of both parts together.
         seconds: of processor time, of both parts together.
     """
-    began, spent, best, best_q, interrupted = time.process_time(), 0, -np.inf, start, False
-    solver, local = (nlopt.opt(algorithm, start.size) for algorithm in (nlopt.G_MLSL_LDS, nlopt.LD_CCSAQ))
+    began = time.process_time()
+    spent = 0
+    best = -np.inf
+    best_q = start
+    interrupted = False
+    solver = nlopt.opt(nlopt.G_MLSL_LDS, start.size)
+    local = nlopt.opt(nlopt.LD_CCSAQ, start.size)
 
     def charged(x: np.ndarray, slope: np.ndarray) -> float:
         nonlocal spent, best, best_q, interrupted
@@ -50,7 +55,9 @@ def mlsl_search(
         try:
             value, gradient = _charged(space, x.reshape(start.shape), index, existing)
         except KeyboardInterrupt:  # NLopt hides an exception of its callbacks behind one of its own
-            interrupted, value, gradient = True, -np.inf, np.zeros(start.shape)
+            interrupted = True
+            value = -np.inf
+            gradient = np.zeros(start.shape)
         if interrupted or time.process_time() - began > seconds / 2:
             solver.force_stop()
         if slope.size:
@@ -72,9 +79,15 @@ def mlsl_search(
     best_q = restored(space, best_q)
     bad = ~is_feasible(space, best_q, FEASIBLE)
     best_q[bad] = start[bad]
-    remaining = 0.0 if interrupted else seconds - (time.process_time() - began)
-    run = improved(space, best_q, index, existing, evaluations=max(1, evaluations - spent), seconds=remaining)
-    return replace(run, evaluations=spent + run.evaluations, interrupted=interrupted or run.interrupted)
+    elapsed = time.process_time() - began
+    if interrupted:
+        remaining = 0.0
+    else:
+        remaining = seconds - elapsed
+    remaining_evaluations = max(1, evaluations - spent)
+    run = improved(space, best_q, index, existing, evaluations=remaining_evaluations, seconds=remaining)
+    evaluations_in_all = spent + run.evaluations
+    return replace(run, evaluations=evaluations_in_all, interrupted=interrupted or run.interrupted)
 
 
 def _charged(space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarray | None) -> tuple[float, np.ndarray]:
@@ -82,5 +95,8 @@ def _charged(space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarr
     value, gradient = merit_of(space, q, index, existing, SHARPNESS[0])
     broken = np.maximum(constraint_values(space, q), 0.0)
     by_q = np.einsum("mk,mkn->mn", broken, constraint_gradients(space, q))
-    value = (value if np.isfinite(value) else -1e6) - CHARGE * float((broken**2).sum())
+    charge = CHARGE * float((broken**2).sum())
+    if not np.isfinite(value):
+        value = -1e6
+    value = value - charge
     return value, gradient - 2.0 * CHARGE * by_q

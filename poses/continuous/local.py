@@ -67,10 +67,14 @@ def merit_of(
     jacobians = np.asarray(space.jacobian(q), dtype=float)
     stacked = jacobians.reshape(-1, jacobians.shape[2])
     if existing is not None and len(existing):
-        stacked = np.concatenate([stacked, existing.reshape(-1, jacobians.shape[2])])
+        measured_rows = existing.reshape(-1, jacobians.shape[2])
+        stacked = np.concatenate([stacked, measured_rows])
     value, slope = merit(stacked, index, sharpness)
-    G = slope[: jacobians.shape[0] * jacobians.shape[1]].reshape(jacobians.shape)
-    return value, product(space, q, G) if np.isfinite(value) else np.zeros_like(q)
+    moving_rows = jacobians.shape[0] * jacobians.shape[1]
+    G = slope[:moving_rows].reshape(jacobians.shape)
+    if not np.isfinite(value):
+        return value, np.zeros_like(q)
+    return value, product(space, q, G)
 
 
 def improved(
@@ -102,21 +106,34 @@ def improved(
         report: called with every improved merit.
     """
     deadline = time.process_time() + seconds
-    start = np.clip(np.asarray(q, dtype=float), space.lower, space.upper)
-    value = merit_of(space, start, index, existing)[0] if is_feasible(space, start, FEASIBLE).all() else -np.inf
-    best, free, spent, interrupted = start, np.ones(len(start), dtype=bool), 1, False
-    history = [value] if np.isfinite(value) else []
+    start = np.asarray(q, dtype=float)
+    start = np.clip(start, space.lower, space.upper)
+    value = -np.inf
+    if is_feasible(space, start, FEASIBLE).all():
+        value, _ = merit_of(space, start, index, existing)
+    free = np.ones(len(start), dtype=bool)
+    best = start
+    spent = 1
+    interrupted = False
+    history = []
+    if np.isfinite(value):
+        history.append(value)
     for _ in range(3):
         fixed_rows = _with_rows(space, best[~free], existing)
-        run = _search(space, best[free], index, fixed_rows, evaluations - spent, tolerance, sharpness, deadline)
-        trial, spent, interrupted = best.copy(), spent + run.evaluations, run.interrupted
+        remaining = evaluations - spent
+        run = _search(space, best[free], index, fixed_rows, remaining, tolerance, sharpness, deadline)
+        trial = best.copy()
+        spent = spent + run.evaluations
+        interrupted = run.interrupted
         trial[free] = run.q
         bad = ~is_feasible(space, trial, FEASIBLE)
         trial[bad] = start[bad]
-        trial_value = merit_of(space, trial, index, existing)[0]
+        trial_value, _ = merit_of(space, trial, index, existing)
         if trial_value > value or (trial_value == value and not bad.any()):
             best, value = trial, trial_value
-            history += [h for h in run.history if max(history, default=-np.inf) < h < value] + [value]
+            highest = max(history, default=-np.inf)
+            history += [stage_merit for stage_merit in run.history if highest < stage_merit < value]
+            history.append(value)
             if report:
                 report(value)
         if interrupted or not (bad & free).any() or spent >= evaluations or time.process_time() > deadline:
@@ -149,21 +166,34 @@ def _search(
 ) -> Improved:
     """Run the stages from one start and return the best feasible set; the predicate is not checked."""
     feasible = bool(_keeps(space, start).all())
-    best, value = start, merit_of(space, start, index, existing)[0] if feasible else -np.inf
-    history, spent, iterate, interrupted = [value], 0, start, False
-    stages = list(sharpness if has_kinks(index) else (np.inf,))
+    best = start
+    value = -np.inf
+    if feasible:
+        value, _ = merit_of(space, start, index, existing)
+    history = [value]
+    spent = 0
+    iterate = start
+    interrupted = False
+    stages = [np.inf]
+    if has_kinks(index):
+        stages = list(sharpness)
     blocks = -(-start.size // MAX_BLOCK)
     while stages and spent < evaluations and time.process_time() < deadline and not interrupted:
         sharp = stages.pop(0)
-        for block in np.array_split(np.random.default_rng(len(history)).permutation(len(start)), blocks):
-            others = np.setdiff1d(np.arange(len(start)), block)
-            fixed_rows = _with_rows(space, iterate[others], existing)
+        order = np.random.default_rng(len(history)).permutation(len(start))
+        for block in np.array_split(order, blocks):
+            fixed = np.setdiff1d(np.arange(len(start)), block)
+            fixed_rows = _with_rows(space, iterate[fixed], existing)
             objective = partial(_objective, space, index, fixed_rows, sharp)
-            patient = tolerance * (10 if stages else 1)
+            stage_tolerance = tolerance
+            if stages:
+                stage_tolerance = 10 * tolerance
+            remaining = evaluations - spent
             block_poses, steps, interrupted = climb(
-                space, iterate[block], objective, evaluations - spent, patient, deadline
+                space, iterate[block], objective, remaining, stage_tolerance, deadline
             )
-            iterate, spent = iterate.copy(), spent + steps
+            iterate = iterate.copy()
+            spent = spent + steps
             iterate[block] = block_poses
             if interrupted or spent >= evaluations or time.process_time() > deadline:
                 break
@@ -171,14 +201,15 @@ def _search(
         if feasible:
             bad = ~_keeps(space, trial)
             trial[bad] = best[bad]
-        reached, last = merit_of(space, trial, index, existing)[0], value
-        if reached > value:
-            best, value = trial, reached
+        trial_value, _ = merit_of(space, trial, index, existing)
+        last = value
+        if trial_value > value:
+            best, value = trial, trial_value
             history.append(value)
-        if (
-            not stages and 10 * tolerance < value - last < np.inf
-        ):  # blocks, and stages cut short by a failed line search
-            stages, iterate = [sharp], best
+        # the last stage again where it gained much: blocks, and stages cut short by a failed line search
+        if not stages and 10 * tolerance < value - last < np.inf:
+            stages = [sharp]
+            iterate = best
     return Improved(best, value, tuple(history), spent, interrupted)
 
 
@@ -205,25 +236,35 @@ def climb(
         ended the search.
     """
     m, n = start.shape
-    count, last, latest, merits = 0, start, 0.0, list[float]()
+    count = 0
+    last = start
+    latest = 0.0
+    merits = list[float]()
 
     def negative(x: np.ndarray) -> tuple[float, np.ndarray]:
         nonlocal count, latest
         count += 1
         value, gradient = objective(x.reshape(m, n))
-        latest = value if np.isfinite(value) else -1e6
+        if np.isfinite(value):
+            latest = value
+        else:
+            latest = -1e6
         return -latest, -gradient.ravel()
 
     def accepted(x: np.ndarray) -> None:
         nonlocal last
         last = x.reshape(m, n).copy()
         merits.append(latest)
-        stalled = len(merits) > PATIENCE and merits[-1] - merits[-1 - PATIENCE] < tolerance
+        stalled = False
+        if len(merits) > PATIENCE:
+            gain = merits[-1] - merits[-1 - PATIENCE]
+            stalled = gain < tolerance
         if stalled or count >= evaluations or time.process_time() > deadline:
             raise _Ended
 
     def values(x: np.ndarray) -> np.ndarray:
-        return -constraint_values(space, x.reshape(m, n)).ravel()
+        values = constraint_values(space, x.reshape(m, n))
+        return -values.ravel()
 
     def slopes(x: np.ndarray) -> np.ndarray:
         blocks = constraint_gradients(space, x.reshape(m, n))
@@ -234,8 +275,12 @@ def climb(
     # slow to load
     import scipy.optimize
 
-    bounds = list(zip(np.tile(space.lower, m), np.tile(space.upper, m), strict=True))
-    constraints = [{"type": "ineq", "fun": values, "jac": slopes}] if space.constraints else []
+    lower = np.tile(space.lower, m)
+    upper = np.tile(space.upper, m)
+    bounds = list(zip(lower, upper, strict=True))
+    constraints = []
+    if space.constraints:
+        constraints.append({"type": "ineq", "fun": values, "jac": slopes})
     options = {"maxiter": evaluations, "ftol": 1e-2 * tolerance}
     try:
         run = scipy.optimize.minimize(
@@ -263,17 +308,23 @@ def restored(space: SearchSpace, q: np.ndarray, steps: int = 20) -> np.ndarray:
     """
     q = np.clip(q, space.lower, space.upper)
     for _ in range(steps if space.constraints else 0):
-        broken = np.flatnonzero((constraint_values(space, q) > 0.1 * FEASIBLE).any(1))
+        is_broken = (constraint_values(space, q) > 0.1 * FEASIBLE).any(1)
+        broken = np.flatnonzero(is_broken)
         if not len(broken):
             break
-        values, slopes = constraint_values(space, q[broken]), constraint_gradients(space, q[broken])
+        values = constraint_values(space, q[broken])
+        slopes = constraint_gradients(space, q[broken])
         for pose, value, slope in zip(broken, values, slopes, strict=True):
             binding = value > -1e-6
             free = np.ones(q.shape[1], dtype=bool)
             for _ in range(q.shape[1]):
                 step = np.zeros(q.shape[1])
-                step[free] = np.linalg.lstsq(slope[binding][:, free], -value[binding] - 0.05 * FEASIBLE, rcond=1e-9)[0]
-                out = free & ((q[pose] + step < space.lower) | (q[pose] + step > space.upper))
+                correction = -value[binding] - 0.05 * FEASIBLE
+                binding_slope = slope[binding][:, free]
+                step[free] = np.linalg.lstsq(binding_slope, correction, rcond=1e-9)[0]
+                moved = q[pose] + step
+                outside = (moved < space.lower) | (moved > space.upper)
+                out = free & outside
                 if not out.any() or out.sum() == free.sum():
                     break
                 free &= ~out
@@ -283,7 +334,8 @@ def restored(space: SearchSpace, q: np.ndarray, steps: int = 20) -> np.ndarray:
 
 def _keeps(space: SearchSpace, q: np.ndarray) -> np.ndarray:
     """Return whether each pose satisfies the constraints that have gradients (m,)."""
-    return np.asarray((constraint_values(space, q) <= FEASIBLE).all(axis=1))
+    satisfied = constraint_values(space, q) <= FEASIBLE
+    return np.asarray(satisfied.all(axis=1))
 
 
 def _with_rows(space: SearchSpace, q: np.ndarray, existing: np.ndarray | None) -> np.ndarray | None:
@@ -292,4 +344,7 @@ def _with_rows(space: SearchSpace, q: np.ndarray, existing: np.ndarray | None) -
         return existing
     rows = np.asarray(space.jacobian(q), dtype=float)
     rows = rows.reshape(-1, rows.shape[2])
-    return rows if existing is None else np.concatenate([rows, existing.reshape(-1, rows.shape[1])])
+    if existing is None:
+        return rows
+    measured_rows = existing.reshape(-1, rows.shape[1])
+    return np.concatenate([rows, measured_rows])

@@ -13,7 +13,8 @@ from ..space import SearchSpace
 
 def random_starts(q: np.ndarray, m: int, count: int, seed: int) -> list[np.ndarray]:
     """Return `count` random sets of m poses out of candidates q (N, n); each set has a separate child of the seed."""
-    return [q[g.choice(len(q), m, replace=False)] for g in np.random.default_rng(seed).spawn(count)]
+    generators = np.random.default_rng(seed).spawn(count)
+    return [q[generator.choice(len(q), m, replace=False)] for generator in generators]
 
 
 def multistart_search(
@@ -39,10 +40,16 @@ def multistart_search(
         map: the builtin, or one that spreads the work; results in order.
         report: called after each start with its number and result.
     """
-    best, spent, history, interrupted = None, 0, list[float](), False
+    best = None
+    spent = 0
+    history = list[float]()
+    interrupted = False
     work = partial(_one, space, index, existing, evaluations)
     deadline = time.process_time() + seconds
-    runs = map(work, starts) if np.isinf(seconds) else _in_time(work, starts, deadline)
+    if np.isinf(seconds):
+        runs = map(work, starts)
+    else:
+        runs = _in_time(work, starts, deadline)
     try:
         for number, run in enumerate(runs):
             spent += run.evaluations

@@ -72,7 +72,10 @@ def tabu_search(
     generator = np.random.default_rng(seed)
     listed: deque[np.ndarray] = deque(maxlen=rule.length)
     deadline = time.process_time() + seconds
-    chosen, history, spent, interrupted = list[np.ndarray](), list[float](), 0, False
+    chosen = list[np.ndarray]()
+    history = list[float]()
+    spent = 0
+    interrupted = False
     try:
         while len(chosen) < m:
             pose, evaluations = _newcomer(space, chosen, index, existing, generator, listed, rule)
@@ -81,26 +84,34 @@ def tabu_search(
             history.append(_merit(space, np.array(chosen), index, existing))
             if report:
                 report(len(chosen), history[-1])
-        spared, failures = set[int](), 0
+        spared = set[int]()
+        failures = 0
         while failures < rule.patience * m and time.process_time() < deadline:
             out = _least_useful(space, np.array(chosen), index, existing, spared)
-            remaining = chosen[:out] + chosen[out + 1 :]
+            remaining = chosen.copy()
+            del remaining[out]
             pose, evaluations = _newcomer(space, remaining, index, existing, generator, listed, rule)
             spent += evaluations
-            value = _merit(space, np.array([*remaining, pose]), index, existing)
+            trial = np.array([*remaining, pose])
+            value = _merit(space, trial, index, existing)
             if value > history[-1] + 1e-9:
-                chosen[out], spared, failures = pose, set[int](), 0
+                chosen[out] = pose
+                spared = set[int]()
+                failures = 0
                 history.append(value)
                 if report:
                     report(m, value)
             else:
                 failures += 1
-                spared = {out} if len(spared) + 1 >= m else spared | {out}
+                spared = spared | {out}
+                if len(spared) >= m:
+                    spared = {out}
     except KeyboardInterrupt:
         if len(chosen) < m:
             raise
         interrupted = True
-    return Improved(np.array(chosen), history[-1], tuple(history[m - 1 :]), spent, interrupted)
+    rising = tuple(history[m - 1 :])
+    return Improved(np.array(chosen), history[-1], rising, spent, interrupted)
 
 
 def _newcomer(
@@ -112,22 +123,31 @@ def _newcomer(
     listed: deque[np.ndarray],
     rule: TabuRule,
 ) -> tuple[np.ndarray, int]:
-    """Return an individually improved pose to add to `others`, and the evaluations used; start and end become tabu."""
+    """Return an individually improved pose to add to `poses`, and the evaluations used; start and end become tabu."""
 
     def allowed(q: np.ndarray) -> np.ndarray:
         good = is_feasible(space, q)
         if listed:
-            good &= (np.abs(q[:, None] - np.array(listed)).max(2) > rule.radius).all(1)
+            differences = np.abs(q[:, None] - np.array(listed)).max(2)
+            good &= (differences > rule.radius).all(1)
         return good
 
     draws = draw_candidates(space.lower, space.upper, rule.candidates, allowed, seed=generator, block=256)
     fixed = _fixed(space, poses, existing)
     jacobians = np.asarray(space.jacobian(draws), dtype=float)
-    rows = fixed.reshape(-1, jacobians.shape[2]) if fixed is not None else np.zeros((0, jacobians.shape[2]))
-    full = len(rows) + jacobians.shape[1] >= jacobians.shape[2]
-    values = np.array([merit(np.concatenate([rows, j]), index)[0] for j in jacobians]) if full else np.array([-np.inf])
+    parameters = jacobians.shape[2]
+    rows = np.zeros((0, parameters))
+    if fixed is not None:
+        rows = fixed.reshape(-1, parameters)
+    count = len(rows) + jacobians.shape[1]
+    full = count >= parameters
+    values = np.full(len(jacobians), -np.inf)
+    if full:
+        for i, jacobian in enumerate(jacobians):
+            values[i], _ = merit(np.concatenate([rows, jacobian]), index)
     if not np.isfinite(values).any():  # not of full rank yet: what spans most, by a slightly regular determinant
-        pose = draws[int(_spanning(rows, jacobians).argmax())]
+        spanned = _spanning(rows, jacobians)
+        pose = draws[int(spanned.argmax())]
         listed.append(pose)
         return pose, len(draws)
     start = draws[int(values.argmax())]
@@ -140,11 +160,15 @@ def _newcomer(
 
 def _spanning(rows: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
     """Return log det(εI + information) (K,) of the rows after adding each Jacobian; columns are scaled by their rms."""
-    scale = np.sqrt((jacobians**2).mean((0, 1)))
+    mean_squares = (jacobians**2).mean((0, 1))
+    scale = np.sqrt(mean_squares)
     scale = np.where(scale > 0, scale, 1.0)
-    z, scaled_rows = jacobians / scale, rows / scale
+    z = jacobians / scale
+    scaled_rows = rows / scale
     matrix = scaled_rows.T @ scaled_rows + 1e-6 * np.eye(len(scale))
-    return np.linalg.slogdet(matrix + z.transpose(0, 2, 1) @ z)[1]
+    matrices = matrix + z.transpose(0, 2, 1) @ z
+    _, values = np.linalg.slogdet(matrices)
+    return values
 
 
 def _least_useful(
@@ -152,24 +176,34 @@ def _least_useful(
 ) -> int:
     """Return the removable pose whose removal leaves the largest merit."""
     jacobians = np.asarray(space.jacobian(q), dtype=float)
-    before = np.zeros((0, jacobians.shape[2])) if existing is None else existing.reshape(-1, jacobians.shape[2])
+    parameters = jacobians.shape[2]
+    measured_rows = np.zeros((0, parameters))
+    if existing is not None:
+        measured_rows = existing.reshape(-1, parameters)
     merits = np.full(len(q), -np.inf)
-    open_ = [i for i in range(len(q)) if i not in spared]
-    for i in open_:
-        remaining = np.delete(jacobians, i, axis=0).reshape(-1, jacobians.shape[2])
-        merits[i] = merit(np.concatenate([before, remaining]), index)[0]
-    return open_[int(merits[open_].argmax())]
+    removable = [i for i in range(len(q)) if i not in spared]
+    for i in removable:
+        remaining = np.delete(jacobians, i, axis=0).reshape(-1, parameters)
+        merits[i], _ = merit(np.concatenate([measured_rows, remaining]), index)
+    best = int(merits[removable].argmax())
+    return removable[best]
 
 
 def _fixed(space: SearchSpace, poses: list[np.ndarray], existing: np.ndarray | None) -> np.ndarray | None:
     """Return the rows (R, p) of the other poses and of those measured before."""
     if not poses:
         return existing
-    jacobians = np.asarray(space.jacobian(np.array(poses)), dtype=float)
+    q = np.array(poses)
+    jacobians = np.asarray(space.jacobian(q), dtype=float)
     rows = jacobians.reshape(-1, jacobians.shape[2])
-    return rows if existing is None else np.concatenate([rows, existing.reshape(-1, rows.shape[1])])
+    if existing is None:
+        return rows
+    return np.concatenate([rows, existing.reshape(-1, rows.shape[1])])
 
 
 def _merit(space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarray | None) -> float:
     rows = _fixed(space, list(q), existing)
-    return merit(rows, index)[0] if rows is not None else -np.inf
+    if rows is None:
+        return -np.inf
+    value, _ = merit(rows, index)
+    return value

@@ -7,7 +7,6 @@ import planted_motion as planted
 import pytest
 
 from calib.data.recordings.recording import Recording
-from calib.data.signals.filtering import kept
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.errors import UsageError
 from calib.identification import standstill
@@ -21,7 +20,7 @@ from calib.identification.standstill import (
     divided,
     left_out_error,
     standing_joints,
-    with_slowness,
+    with_breakaway,
     with_standstills,
     with_weights,
 )
@@ -214,21 +213,32 @@ def test_left_out_motion_does_not_ask_for_standing_rows_where_friction_holds_the
     )
 
 
-def test_slow_rows_count_less_where_the_model_errs_more_there():
+@pytest.mark.parametrize("reach", [0.0, 0.01])
+def test_rows_after_a_standstill_count_less_over_the_travel_in_which_its_friction_fades(reach):
+    """Friction at rest is random here; planted is how far it goes on while the joint moves away."""
     case = stop_and_go(4)
-    settings, decimator = PLAIN, common_decimator([case], PLAIN)
-    rows = rows_of(case)
-    values = first_fit(rows).values
-    speed = np.abs(case.motion.v[kept(case.motion.segment, decimator)])
-    peak = np.abs(case.motion.v).max(axis=0)
-    moves = rows[0].present & (rows[0].standing == 0.0)
-    slow = speed < standstill.SLOW * peak
-    residual = np.where(slow, 5.0, 1.0) * np.random.default_rng(0).normal(size=moves.shape)
-    part = replace(rows[0], target=rows[0].matrix @ values + residual)
-    torque_rows = make_model(planted.arm(), settings).torque_rows
-    (weighed,) = with_slowness([part], [case], decimator, torque_rows, values)
-    assert weighed.slowness.min() < 0.8
-    assert (weighed.slowness[speed > 3.0 * standstill.SLOW * peak] == 1.0).all()
-    exact = replace(rows[0], target=rows[0].matrix @ values + np.where(slow, 0.1, 1.0) * residual)
-    (alike,) = with_slowness([exact], [case], decimator, torque_rows, values)
-    assert (alike.slowness == 1.0).all(), "slow rows never count more"
+    decimator, torque_rows = common_decimator([case], PLAIN), make_model(planted.arm(), PLAIN).torque_rows
+    (part,) = rows_of(case)
+    values = first_fit([part]).values
+    travel = standstill._travel_since_standstill(part, case, decimator, torque_rows)
+    rests = part.standing > 0.0
+    rng = np.random.default_rng(0)
+    friction = np.where(rests, 20.0, 0.0)
+    if reach:
+        friction = np.where(rests, friction, 20.0 * np.exp(-travel / reach))
+    residual = rng.normal(size=rests.shape) + friction * rng.normal(size=rests.shape)
+    part = replace(part, target=part.matrix @ values + residual)
+    (weighed,) = with_breakaway([part], [case], decimator, torque_rows, values)
+    if reach == 0.0:
+        assert (weighed.breakaway == 1.0).all()
+        return
+    near, far = ~rests & (travel < 0.3 * reach), ~rests & (travel > 5.0 * reach)
+    assert near.any() and weighed.breakaway[near].max() < 0.2 and weighed.breakaway[far].min() > 0.99
+
+
+def test_rows_before_any_standstill_are_as_others():
+    case = planted.case("a", 0)
+    (part,) = rows_of(case)
+    decimator, torque_rows = common_decimator([case], PLAIN), make_model(planted.arm(), PLAIN).torque_rows
+    (weighed,) = with_breakaway([part], [case], decimator, torque_rows, first_fit([part]).values)
+    assert (weighed.breakaway == 1.0).all()

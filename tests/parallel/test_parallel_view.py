@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from calib import cli
-from calib.apps.viewer import scene as viewing
 from calib.apps.viewer import viewer
 from calib.parallel.mechanism.closure import closed
 from calib.parallel.mechanism.geometric_fit import changed, loop_parameters
 from calib.parallel.robots import find
 from calib.parallel.view import picture
+from calib.results import scene as viewing
 
 
 def recorded(path: Path) -> dict[str, list]:

@@ -111,3 +111,13 @@ def test_the_glossary_is_plain_and_complete():
     for term, meaning in findings.glossary().items():
         assert not re.search(PRIVATE, meaning) and len(meaning.split()) <= 32 and meaning.endswith("."), term
     assert 50 <= len(findings.glossary()) <= 80 and not set(findings.glossary()) & set(catalogue())
+
+
+@pytest.mark.parametrize("code", CODES)
+def test_an_explanation_shows_words_and_no_template(code):
+    text = findings.explain(code)
+    assert not re.search(r"[{}<>]", text.replace("> ", "").replace("->", "")), text
+
+
+def test_values_of_a_template_are_named_in_capitals():
+    assert findings.in_words("{rms:.3g mm} at {angle:.0f °}<, {rival_arm} too>") == "RMS mm at ANGLE°[, RIVAL ARM too]"

@@ -84,10 +84,10 @@ ELEMENT = {"name": "a.offset", "axis": "rz", "joint": 0}
 @pytest.mark.parametrize(
     "element, message",
     [
-        ({"axes": "rz"}, r"number 1: there is no key 'axes' .did you mean 'axis'"),
-        ({"axis": "rw"}, r"axis 'rw' is not one of tx, ty"),
+        ({"axes": "rz"}, r"number 1 \('a.offset'\): there is no key 'axes' .did you mean 'axis'"),
+        ({"axis": "rw"}, r"axis: expected one of tx, ty, tz, rx, ry, rz, found 'rw'"),
         ({"joint": 1}, r"joint 1 is not an integer from 0 to 0"),
-        ({"owner": -1}, r"owner -1 is not an integer from 0 to 1"),
+        ({"owner": -1}, r"\('a.offset'\), owner: expected a whole number, 0 or more, found -1"),
         ({"sign": 0.5}, r"sign 0.5 is neither 1 nor -1"),
         ({"value": "1 mm"}, r"value: cannot read '1 mm'"),
         ({"placement": {"matrix": [[1, 0, 0, 0], [0, 2, 0, 0], [0, 0, 1, 0]]}}, r"is not a rotation"),
@@ -111,9 +111,9 @@ A, E = '[[joint]]\nname="a"\n', '[[element]]\nname="e"\naxis="rz"\n'
 @pytest.mark.parametrize(
     "text, message",
     [
-        (f"{A}{E}joint=0", r"'name' is missing"),
-        (f'name="x"\nbase=5\n{A}{E}joint=0', r"'base' must be text, found 5"),
-        (f'name="x"\n{E}joint=0', r"no \[\[joint\]\] tables found"),
+        (f"{A}{E}joint=0", r"there is no 'name'; needed are name, joint"),
+        (f'name="x"\nbase=5\n{A}{E}joint=0', r"base: expected a text, found 5"),
+        (f'name="x"\n{E}joint=0', r"there is no 'joint'; needed are name, joint, element"),
         (f'name="x"\n{A}{E}', r"every joint must move"),
         (f'name="x"\n{A}kinds=1\n{E}', r"there is no key 'kinds' .did you mean 'kind'"),
         ('name = "x"\n[[joint]\n', r"robot\.toml: is not a TOML file: .*line 2"),

@@ -61,8 +61,11 @@ class Observed(NamedTuple):
         """Return ∂F/∂regressor (N, n, b) = 2 W S over the sigmas, with S = ∂F/∂M (c, c), symmetric."""
         count, n, b = self.shape
         slope = np.zeros((b, n, count))
-        slope[self.columns] = (2 * by_information @ self.W.T).reshape(len(by_information), n, count)
-        return (slope if self.sigmas is None else slope / self.sigmas[:, None]).transpose(2, 1, 0)
+        by_matrix = 2 * by_information @ self.W.T
+        slope[self.columns] = by_matrix.reshape(len(by_information), n, count)
+        if self.sigmas is not None:
+            slope = slope / self.sigmas[:, None]
+        return slope.transpose(2, 1, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +99,9 @@ class Excitation:
 
     @property
     def name(self) -> str:
-        return self.index + (f" {self.scaling}" if isinstance(self.scaling, str) else " scaled")
+        if isinstance(self.scaling, str):
+            return f"{self.index} {self.scaling}"
+        return f"{self.index} scaled"
 
     def evaluate(self, motion: SampledMotion, regressor: np.ndarray) -> Value:
         """Return the index and its gradient with respect to the information."""
@@ -104,10 +109,17 @@ class Excitation:
 
     def observed(self, regressor: np.ndarray) -> Observed:
         """Return the observation matrix of a regressor (N, n, b), of the objective's columns, and its information."""
-        columns = slice(None) if self.columns is None else self.columns
-        Y = regressor.transpose(2, 1, 0)[columns].transpose(2, 1, 0)
-        W = _stacked(Y if self.sigmas is None else Y / self.sigmas[:, None])
-        existing = None if self.existing is None else self.existing[columns][:, columns]
+        columns = slice(None)
+        if self.columns is not None:
+            columns = self.columns
+        by_column = regressor.transpose(2, 1, 0)[columns]
+        Y = by_column.transpose(2, 1, 0)
+        if self.sigmas is not None:
+            Y = Y / self.sigmas[:, None]
+        W = _stacked(Y)
+        existing = None
+        if self.existing is not None:
+            existing = self.existing[columns][:, columns]
         return Observed(W, information(W, existing), regressor.shape, self.sigmas, columns)
 
     def seen(self, matrix: Observed) -> Value:
@@ -126,26 +138,39 @@ class Excitation:
         if self.index == "trace":
             return self._trace(M)
         normalised = isinstance(self.scaling, str) and self.scaling == "normalised"
-        d = diagonal**-0.5 if normalised else (1.0 if isinstance(self.scaling, str) else 1.0 / self.scaling)
+        if normalised:
+            d = diagonal**-0.5
+        elif isinstance(self.scaling, str):
+            d = 1.0
+        else:
+            d = 1.0 / self.scaling
         d = np.broadcast_to(d, diagonal.shape)
         C = M * d * d[:, None]
         eigenvalues, V = np.linalg.eigh(C)
         rounding = 1e-15  # eigenvalues below this part of the largest are rounding
         eigenvalues = np.maximum(eigenvalues, rounding * eigenvalues[-1])
         value, slope = self._of_spectrum(eigenvalues)
-        exact = value if np.isinf(self.sharpness) else replace(self, sharpness=np.inf)._of_spectrum(eigenvalues)[0]
+        exact = value
+        if not np.isinf(self.sharpness):
+            unsmoothed = replace(self, sharpness=np.inf)
+            exact, _ = unsmoothed._of_spectrum(eigenvalues)
         by_c = (V * slope) @ V.T
         by_m = by_c * d * d[:, None]
         if normalised:
-            by_m -= np.diag(np.einsum("ij,ji->i", C, by_c) / diagonal)
+            along_scale = np.einsum("ij,ji->i", C, by_c)
+            by_m -= np.diag(along_scale / diagonal)
         return value, by_m, exact
 
     def _trace(self, M: np.ndarray) -> tuple[float, np.ndarray, float]:
         """Return log tr(A M⁻¹) / 2, its derivative by M, -M⁻¹ A M⁻¹ / (2 tr), and the index again: it has no kinks."""
         d = np.diag(M) ** -0.5
-        eigenvalues, V = np.linalg.eigh(M * d * d[:, None])
-        inverse = (V / np.maximum(eigenvalues, 1e-15 * eigenvalues[-1])) @ V.T * d * d[:, None]
-        spread = inverse if self.task is None else inverse @ self.task
+        scaled = M * d * d[:, None]
+        eigenvalues, V = np.linalg.eigh(scaled)
+        regular = np.maximum(eigenvalues, 1e-15 * eigenvalues[-1])
+        inverse = (V / regular) @ V.T * d * d[:, None]
+        spread = inverse
+        if self.task is not None:
+            spread = inverse @ self.task
         trace = float(np.trace(spread))
         value = 0.5 * np.log(trace)
         return value, -0.5 * spread @ inverse / trace, value
@@ -156,7 +181,8 @@ class Excitation:
             return -float(np.log(eigenvalues).mean()), -1.0 / eigenvalues / len(eigenvalues)
         low, by_low = _extreme(eigenvalues, -self.sharpness)
         if self.index == "smallest":
-            return -np.exp(low / 2), -np.exp(low / 2) / 2 * by_low
+            smallest = np.exp(low / 2)
+            return -smallest, -smallest / 2 * by_low
         high, by_high = _extreme(eigenvalues, self.sharpness)
         value = float(np.exp((high - low) / 2))
         return value, value / 2 * (by_high - by_low)
@@ -187,11 +213,13 @@ class TorqueSlack:
 
     @property
     def name(self) -> str:
-        return self.label or "torque slack of joints " + ", ".join(str(j + 1) for j in self.joints)
+        numbers = ", ".join(str(j + 1) for j in self.joints)
+        return self.label or f"torque slack of joints {numbers}"
 
     def evaluate(self, motion: SampledMotion, regressor: np.ndarray) -> Value:
         chosen = list(self.joints)
-        ratio = regressor[:, chosen] @ self.parameters / self.limits[chosen]
+        torque = regressor[:, chosen] @ self.parameters
+        ratio = torque / self.limits[chosen]
         size = np.sqrt(ratio**2 + self.smoothing**2)
         by_torque = np.zeros(regressor.shape[:2])
         by_torque[:, chosen] = -ratio / size / self.limits[chosen] / ratio.size
@@ -221,14 +249,20 @@ class FrictionCoverage:
 
     def evaluate(self, motion: SampledMotion, regressor: np.ndarray) -> Value:
         count, n = motion.v.shape
-        value, slope = 0.0, np.zeros((4, count, n))
-        slow, fast = self.width * self.low, self.width * self.high
+        value = 0.0
+        slope = np.zeros((4, count, n))
+        slow = self.width * self.low
+        fast = self.width * self.high
         for sign in (1.0, -1.0):
             v = sign * motion.v
-            (zero, d_zero), (lo, d_lo) = _logistic(v / slow), _logistic((v - self.low) / slow)
+            zero, d_zero = _logistic(v / slow)
+            lo, d_lo = _logistic((v - self.low) / slow)
             hi, d_hi = _logistic((v - self.high) / fast)
-            for member, by_v in ((hi, d_hi / fast), (zero - lo, (d_zero - d_lo) / slow)):
-                missing = np.maximum(0.0, 1.0 - member.mean(axis=0) / self.wanted)
+            at_high = (hi, d_hi / fast)
+            at_low = (zero - lo, (d_zero - d_lo) / slow)
+            for member, by_v in (at_high, at_low):
+                share = member.mean(axis=0)
+                missing = np.maximum(0.0, 1.0 - share / self.wanted)
                 value += float((missing**2).sum()) / (4 * n)
                 slope[1] -= sign * 2 * missing / self.wanted / count / (4 * n) * by_v
         return Value(value, None, slope, exact=value)
@@ -237,7 +271,9 @@ class FrictionCoverage:
         """Return the exact shares of time (4, n): fast forward, slow forward, fast backward, slow backward."""
         rows = []
         for v in (motion.v, -motion.v):
-            rows += [(v > self.high).mean(axis=0), ((v > 0) & (v < self.low)).mean(axis=0)]
+            fast = (v > self.high).mean(axis=0)
+            slow = ((v > 0) & (v < self.low)).mean(axis=0)
+            rows += [fast, slow]
         return np.array(rows)
 
 
@@ -248,7 +284,8 @@ class Duration:
     name: str = "duration"
 
     def evaluate(self, motion: SampledMotion, regressor: np.ndarray) -> Value:
-        value = float(len(motion) * (motion.times[1] - motion.times[0]))
+        step = motion.times[1] - motion.times[0]
+        value = float(len(motion) * step)
         return Value(value, by_duration=1.0, exact=value)
 
 
@@ -258,7 +295,9 @@ Objective = Excitation | TorqueSlack | FrictionCoverage | Duration
 def information(stacked: np.ndarray, existing: np.ndarray | None = None) -> np.ndarray:
     """Return M = Wᵀ W + M_existing of a stacked W (rows, b)."""
     M = stacked.T @ stacked
-    return M if existing is None else M + existing
+    if existing is None:
+        return M
+    return M + existing
 
 
 def condition_numbers(
@@ -275,17 +314,25 @@ def condition_numbers(
         existing: (b, b) information of motions recorded before.
         columns: (c,) which columns count; None: all.
     """
-    W = _stacked(regressor if sigmas is None else regressor / sigmas[:, None])
+    if sigmas is not None:
+        regressor = regressor / sigmas[:, None]
+    W = _stacked(regressor)
     triangle = np.asarray(np.linalg.qr(W, mode="r"))
     if existing is not None:
         values, V = np.linalg.eigh(existing)
-        triangle = np.concatenate([triangle, np.sqrt(np.maximum(values, 0.0))[:, None] * V.T])
-    triangle = triangle if columns is None else triangle[:, columns]
+        rows = np.sqrt(np.maximum(values, 0.0))[:, None] * V.T
+        triangle = np.concatenate([triangle, rows])
+    if columns is not None:
+        triangle = triangle[:, columns]
     norms = np.linalg.norm(triangle, axis=0)
     if not norms.all():
         return {"raw": np.inf, "normalised": np.inf}
     spectra = {"raw": triangle, "normalised": triangle / norms}
-    return {key: _cond(np.linalg.svd(matrix, compute_uv=False)) for key, matrix in spectra.items()}
+    numbers = {}
+    for key, matrix in spectra.items():
+        singular_values = np.linalg.svd(matrix, compute_uv=False)
+        numbers[key] = _cond(singular_values)
+    return numbers
 
 
 def _cond(s: np.ndarray) -> float:
@@ -302,12 +349,18 @@ def _extreme(eigenvalues: np.ndarray, p: float) -> tuple[float, np.ndarray]:
     """Return log (Σ λ^p)^(1/p) and its gradient in λ; the log of the largest λ for p = ∞, of the smallest for -∞."""
     logs = np.log(eigenvalues)
     if np.isinf(p):
-        slope, k = np.zeros_like(logs), int(np.argmax(logs) if p > 0 else np.argmin(logs))
+        slope = np.zeros_like(logs)
+        if p > 0:
+            k = int(np.argmax(logs))
+        else:
+            k = int(np.argmin(logs))
         slope[k] = 1.0 / eigenvalues[k]
         return float(logs[k]), slope
     top = (p * logs).max()
     shares = np.exp(p * logs - top)
-    return float((top + np.log(shares.sum())) / p), shares / shares.sum() / eigenvalues
+    total = shares.sum()
+    value = float((top + np.log(total)) / p)
+    return value, shares / total / eigenvalues
 
 
 def _logistic(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -14,6 +14,7 @@ from typing import get_args
 
 import numpy as np
 
+from ..constraints import MotionConstraint
 from ..design.problem import ExcitationProblem, exact_values, stretched, unmet
 from ..design.search import STAGES, Method, SearchResult, Stage, Stuck, one_start
 from ..errors import BadInput, NotExciting, NothingFeasible, require
@@ -66,14 +67,10 @@ def design(
     if not search.found:
         raise _nothing(problem, search.stuck, len(tasks))
     best = min(polished or search.found, key=lambda result: result.merit)
-    share = sum(result.feasible * result.evaluations for result in search.found) / search.spent
-    return replace(
-        best,
-        evaluations=search.spent,
-        feasible=share,
-        seconds=time.perf_counter() - began,
-        interrupted=search.interrupted,
-    )
+    feasible_evaluations = sum(result.feasible * result.evaluations for result in search.found)
+    share = feasible_evaluations / search.spent
+    seconds = time.perf_counter() - began
+    return replace(best, evaluations=search.spent, feasible=share, seconds=seconds, interrupted=search.interrupted)
 
 
 class _Starts:
@@ -150,22 +147,32 @@ def _nothing(problem: ExcitationProblem, stuck: list[Stuck], starts: int) -> Not
     best = min(stuck, key=lambda start: start.excess)
     motion = stretched(problem.basis().motion(best.x), best.factor)
     if best.excess[0] <= 0.0 and problem.goals:
-        values = exact_values(problem, motion, problem.regressor(motion.q, motion.v, motion.a))
-        if (missed := unmet(problem, values)) is not None:  # every limit was kept, so a hard goal stood in the way
+        regressor = problem.regressor(motion.q, motion.v, motion.a)
+        values = exact_values(problem, motion, regressor)
+        missed = unmet(problem, values)
+        # every limit was kept, so a hard goal stood in the way
+        if missed is not None:
             lacking, goal, value = missed
+            wording = goal.words or f"{goal.objective.name} ≤ {goal.goal:g}"
             return NothingFeasible(
-                f"the hard goal {goal.words or f'{goal.objective.name} ≤ {goal.goal:g}'} was not reached in "
+                f"the hard goal {wording} was not reached in "
                 f"{_counted(starts)}, though all limits were kept: the nearest motion has {goal.stated(value):.4g}; "
                 "relax it, give it a weight, or take a longer period",
                 goal.objective.name,
                 lacking,
                 "of the goal",
             )
-    worst = max(problem.constraints, key=lambda c: float((c.values(motion) / c.scale).max()), default=None)
+
+    def excess_share(constraint: MotionConstraint) -> float:
+        scaled = constraint.values(motion) / constraint.scale
+        return float(scaled.max())
+
+    worst = max(problem.constraints, key=excess_share, default=None)
     if worst is None:
         raise NotExciting(f"no motion could be evaluated: {best.reason}")
     values = worst.values(motion)
-    row, column = np.unravel_index(np.argmax(values / worst.scale), values.shape)
+    largest = np.argmax(values / worst.scale)
+    row, column = np.unravel_index(largest, values.shape)
     excess = float(values[row, column])
     return NothingFeasible(
         f"no feasible motion in {_counted(starts)}: the nearest one breaks the {worst.name} limit "
@@ -178,4 +185,6 @@ def _nothing(problem: ExcitationProblem, stuck: list[Stuck], starts: int) -> Not
 
 
 def _counted(starts: int) -> str:
-    return f"{starts} start{'' if starts == 1 else 's'}"
+    if starts == 1:
+        return "1 start"
+    return f"{starts} starts"

@@ -76,36 +76,44 @@ def sweep(
     for number, level in enumerate(levels, 1):
         table = np.array(values)
         front = np.where(table[:, 1] <= level, table[:, 0], np.inf)
-        goals = (AttainmentGoal(first, float(values[0][0])), AttainmentGoal(second, float(level), 0.0))
-        spot, best = replace(problem, goals=goals), None
-        for k in {int(np.argmin(front)), int(np.argmin(np.abs(table[:, 1] - level)))}:
-            guess = np.append(points[k].x, points[k].factor) if problem.free_period else points[k].x
+        first_goal = AttainmentGoal(first, float(values[0][0]))
+        second_goal = AttainmentGoal(second, float(level), 0.0)
+        goals = (first_goal, second_goal)
+        spot = replace(problem, goals=goals)
+        best = None
+        least_merit = np.inf
+        best_within = int(np.argmin(front))
+        nearest = int(np.argmin(np.abs(table[:, 1] - level)))
+        for k in {best_within, nearest}:
+            guess = points[k].x
+            if problem.free_period:
+                guess = np.append(guess, points[k].factor)
             run = one_start(spot, evaluations, "slsqp", 0, guess, STAGES[1:])
-            if isinstance(run, SearchResult) and run.merit < (np.inf if best is None else best.merit):
+            if isinstance(run, SearchResult) and run.merit < least_merit:
                 best = run
+                least_merit = run.merit
         if best is not None:
             points.append(best)
             values.append(best.values)
         if report:
             report(number, len(levels), f"{len(points) - 1} motions on the Pareto front")
     table = np.array(values)
-    return Front(
-        (first.name, second.name),
-        table,
-        tuple(points),
-        non_dominated(table),
-        next(k for k, run in enumerate(points) if run is designed),
-    )
+    designed_index = next(k for k, run in enumerate(points) if run is designed)
+    return Front((first.name, second.name), table, tuple(points), non_dominated(table), designed_index)
 
 
 def _of(problem: ExcitationProblem, objectives: Sequence[Objective], run: SearchResult) -> np.ndarray:
     """Return the objectives of a motion, not smoothed."""
-    spot = replace(problem, objectives=tuple((objective, 1.0) for objective in objectives), goals=())
+    weighted = tuple((objective, 1.0) for objective in objectives)
+    spot = replace(problem, objectives=weighted, goals=())
     motion = stretched(spot.basis().motion(run.x), run.factor)
-    return exact_values(spot, motion, problem.regressor(motion.q, motion.v, motion.a))
+    regressor = problem.regressor(motion.q, motion.v, motion.a)
+    return exact_values(spot, motion, regressor)
 
 
 def non_dominated(values: np.ndarray) -> np.ndarray:
     """Return which rows (m, k) are not dominated (no other row is as small everywhere and smaller somewhere)."""
-    better = (values[:, None] <= values[None]).all(-1) & (values[:, None] < values[None]).any(-1)
+    nowhere_larger = (values[:, None] <= values[None]).all(-1)
+    somewhere_smaller = (values[:, None] < values[None]).any(-1)
+    better = nowhere_larger & somewhere_smaller
     return np.logical_not(better.any(axis=0))

@@ -35,18 +35,25 @@ class AttainmentGoal:
 
     @property
     def share(self) -> float:
-        return abs(self.goal) if self.weight is None else self.weight
+        if self.weight is None:
+            return abs(self.goal)
+        return self.weight
 
     def stated(self, value: float) -> float:
         """Return a value F as `words` state it: mean torque over its limit, share of time covered, else F itself."""
         if isinstance(self.objective, FrictionCoverage):
             return self.objective.wanted * (1.0 - float(np.sqrt(value)))  # of its rms shortfall
-        return 1.0 - value if isinstance(self.objective, TorqueSlack) else value
+        if isinstance(self.objective, TorqueSlack):
+            return 1.0 - value
+        return value
 
     def attainment(self, value: float) -> float:
         """Return the γ at which F = value just meets the goal; 0 or infinite for a hard goal."""
         if self.share == 0:
-            return -np.inf if value <= self.goal + 1e-6 * max(abs(self.goal), 1e-3) else np.inf
+            rounding = 1e-6 * max(abs(self.goal), 1e-3)
+            if value <= self.goal + rounding:
+                return -np.inf
+            return np.inf
         return (value - self.goal) / self.share
 
 
@@ -95,7 +102,8 @@ class ExcitationProblem:
 
     def basis(self) -> Basis:
         """Return the family at the samples, then at the extra times."""
-        return self.family.basis(np.append(sample_times(self.family.period, self.samples), self.extra))
+        times = np.append(sample_times(self.family.period, self.samples), self.extra)
+        return self.family.basis(times)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +134,9 @@ class Evaluation:
     @cached_property
     def sampled(self) -> SampledMotion:
         """The motion at the samples only, on which the objectives depend."""
-        return self.motion.part(np.arange(self.problem.samples)) if len(self.problem.extra) else self.motion
+        if not len(self.problem.extra):
+            return self.motion
+        return self.motion.part(np.arange(self.problem.samples))
 
     @property
     def regressor(self) -> np.ndarray:
@@ -135,17 +145,23 @@ class Evaluation:
     @property
     def values(self) -> np.ndarray:
         """Smoothed values (k,) of the objectives or goals."""
-        return np.array([value.value for value in self._found[0]])
+        values, _ = self._found
+        return np.array([value.value for value in values])
 
     @property
     def exact(self) -> np.ndarray:
         """Unsmoothed values (k,) of the objectives or goals."""
-        return np.array([value.exact for value in self._found[0]])
+        values, _ = self._found
+        return np.array([value.exact for value in values])
 
     @property
     def total(self) -> float:
         """The weighted sum of the smoothed objectives; 0 for problems with goals."""
-        return 0.0 if self.problem.goals else _summed(self.problem, [value.value for value in self._found[0]])[0]
+        if self.problem.goals:
+            return 0.0
+        values, _ = self._found
+        total, _ = _summed(self.problem, [value.value for value in values])
+        return total
 
     @property
     def slopes(self) -> np.ndarray:
@@ -165,21 +181,24 @@ class Evaluation:
     def _found(self) -> tuple[list[Value], dict[_Matrix, Observed]]:
         observed: dict[_Matrix, Observed] = {}
         terms = (_sharpened(term, self.sharpness) for term in _terms(self.problem))
-        return [_value(term, self.sampled, self.regressor, observed) for term in terms], observed
+        values = [_value(term, self.sampled, self.regressor, observed) for term in terms]
+        return values, observed
 
     @cached_property
     def _gradient(self) -> np.ndarray:
         values, observed = self._found
         shares = np.eye(len(values))
         if not self.problem.goals:
-            shares = _summed(self.problem, [value.value for value in values])[1]
+            _, shares = _summed(self.problem, [value.value for value in values])
         slopes = [_slope(self.problem, self.sampled, self.regressor, values, share, observed) for share in shares]
-        return self._by_variables(slopes, shares @ np.array([value.by_duration for value in values]))
+        by_duration = np.array([value.by_duration for value in values])
+        return self._by_variables(slopes, shares @ by_duration)
 
     def _by_variables(self, slopes: list[np.ndarray], by_duration: np.ndarray) -> np.ndarray:
         spread = np.zeros((len(slopes), 4, *self.motion.q.shape))
         spread[:, :, : self.problem.samples] = slopes
-        stacked = np.concatenate([spread, *(part.slopes(self.motion) for part in self.smoothed)])
+        part_slopes = [part.slopes(self.motion) for part in self.smoothed]
+        stacked = np.concatenate([spread, *part_slopes])
         return _by_variables(self.problem, self.basis, self.motion, stacked, self.factor, by_duration)
 
 
@@ -190,22 +209,23 @@ def evaluate(problem: ExcitationProblem, basis: Basis, y: np.ndarray, sharpness:
         basis: `ExcitationProblem.basis`.
         sharpness: p of the spectra and ρ of the constraints.
     """
-    x, factor = (y[:-1], float(y[-1])) if problem.free_period else (y, problem.stretch[0])
+    x, factor = _variables(problem, y)
     motion = stretched(basis.motion(x), factor)
     tightenings = np.broadcast_to(problem.tightening, len(problem.constraints))
-    parts = tuple(
-        smoothed(c, motion, sharpness[1], float(tightening)) for c, tightening in zip(problem.constraints, tightenings)
-    )
-    return Evaluation(
-        problem,
-        basis,
-        motion,
-        factor,
-        sharpness[0],
-        parts,
-        np.concatenate([np.zeros(0), *(part.values for part in parts)]),
-        max((part.excess for part in parts), default=-np.inf),
-    )
+    of_spectra, of_constraints = sharpness
+    parts = []
+    for constraint, tightening in zip(problem.constraints, tightenings):
+        parts.append(smoothed(constraint, motion, of_constraints, float(tightening)))
+    values = np.concatenate([np.zeros(0), *(part.values for part in parts)])
+    excess = max((part.excess for part in parts), default=-np.inf)
+    return Evaluation(problem, basis, motion, factor, of_spectra, tuple(parts), values, excess)
+
+
+def _variables(problem: ExcitationProblem, y: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the family's variables and the factor on the period of a point y."""
+    if problem.free_period:
+        return y[:-1], float(y[-1])
+    return y, problem.stretch[0]
 
 
 def critical_times(
@@ -224,7 +244,7 @@ def critical_times(
         count: instants to look at.
     """
     times = sample_times(problem.family.period, count)
-    x, factor = (y[:-1], float(y[-1])) if problem.free_period else (y, problem.stretch[0])
+    x, factor = _variables(problem, y)
     motion = stretched(problem.family.basis(times).motion(x), factor)
     is_critical = np.zeros(len(times), dtype=bool)
     near_share = 0.1  # of a constraint's scale: instants so near to what is broken are looked at besides (our choice)
@@ -233,7 +253,8 @@ def critical_times(
         is_critical |= (shares > -near_share) & (shares.max() > min_excess)
     critical = times[is_critical]
     max_extra = 150  # instants that are added at a time
-    return critical[:: -(-len(critical) // max_extra) or 1]
+    stride = -(-len(critical) // max_extra)
+    return critical[:: stride or 1]
 
 
 def _value(objective: Objective, motion: SampledMotion, Y: np.ndarray, observed: dict[_Matrix, Observed]) -> Value:
@@ -252,10 +273,13 @@ def _matrix(objective: Excitation) -> _Matrix:
 
 def _summed(problem: ExcitationProblem, values: list[float]) -> tuple[float, np.ndarray]:
     """Return the weighted sum with log condition numbers, and its gradient (1, k) in the values."""
-    logs = np.array([is_condition(objective) for objective, _ in problem.objectives])
-    weights, sizes = np.array([weight for _, weight in problem.objectives]), np.array(values)
+    is_log = [is_condition(objective) for objective, _ in problem.objectives]
+    logs = np.array(is_log)
+    weights = np.array([weight for _, weight in problem.objectives])
+    sizes = np.array(values)
     sizes = np.where(logs, sizes, 1.0)
-    return float(weights @ np.where(logs, np.log(sizes), values)), (weights / sizes)[None]
+    terms = np.where(logs, np.log(sizes), values)
+    return float(weights @ terms), (weights / sizes)[None]
 
 
 def _slope(
@@ -267,7 +291,8 @@ def _slope(
     observed: dict[_Matrix, Observed],
 ) -> np.ndarray:
     """Return the gradients (4, N, n) of Σ shares · objectives in q, v, a, jerk, by one derivative product."""
-    result, by_regressor = np.zeros((4, *motion.q.shape)), None
+    result = np.zeros((4, *motion.q.shape))
+    by_regressor = None
     by_information: dict[_Matrix, np.ndarray] = {}
     for value, objective, share in zip(values, _terms(problem), shares):
         if share == 0.0:
@@ -290,11 +315,15 @@ def _slope(
 
 def _terms(problem: ExcitationProblem) -> list[Objective]:
     """Return the objectives to evaluate: those of the goals, or those of the weighted sum."""
-    return [goal.objective for goal in problem.goals] or [objective for objective, _ in problem.objectives]
+    if problem.goals:
+        return [goal.objective for goal in problem.goals]
+    return [objective for objective, _ in problem.objectives]
 
 
 def _sharpened(objective: Objective, p: float) -> Objective:
-    return replace(objective, sharpness=p) if isinstance(objective, Excitation) else objective
+    if not isinstance(objective, Excitation):
+        return objective
+    return replace(objective, sharpness=p)
 
 
 def is_condition(objective: Objective) -> bool:
@@ -303,14 +332,19 @@ def is_condition(objective: Objective) -> bool:
 
 def exact_values(problem: ExcitationProblem, motion: SampledMotion, regressor: np.ndarray) -> np.ndarray:
     """Return the unsmoothed objectives of a motion (k,)."""
-    return np.array([_sharpened(objective, np.inf).evaluate(motion, regressor).value for objective in _terms(problem)])
+    values = []
+    for objective in _terms(problem):
+        unsmoothed = _sharpened(objective, np.inf)
+        values.append(unsmoothed.evaluate(motion, regressor).value)
+    return np.array(values)
 
 
 def merit(problem: ExcitationProblem, values: np.ndarray) -> float:
     """Return the merit to minimise: γ, or the weighted sum with log condition numbers."""
     if problem.goals:
         return max(goal.attainment(value) for goal, value in zip(problem.goals, values))
-    return _summed(problem, list(values))[0]
+    total, _ = _summed(problem, list(values))
+    return total
 
 
 def unmet(problem: ExcitationProblem, values: np.ndarray) -> tuple[float, AttainmentGoal, float] | None:
@@ -327,9 +361,10 @@ def stretched(motion: SampledMotion, factor: float) -> SampledMotion:
     """Return the motion along the same path, `factor` times slower."""
     if factor == 1.0:
         return motion
-    return SampledMotion(
-        factor * motion.times, motion.q, motion.v / factor, motion.a / factor**2, motion.jerk / factor**3
-    )
+    velocity = motion.v / factor
+    acceleration = motion.a / factor**2
+    jerk = motion.jerk / factor**3
+    return SampledMotion(factor * motion.times, motion.q, velocity, acceleration, jerk)
 
 
 def _by_variables(
@@ -342,11 +377,15 @@ def _by_variables(
 ) -> np.ndarray:
     """Return gradients (m, p) by (x, factor): d v/d factor = -v / factor, and so on."""
     powers = factor ** np.arange(4)
-    gradient = basis.adjoint(slopes / powers[:, None, None] if factor != 1.0 else slopes)
+    in_family_time = slopes
+    if factor != 1.0:
+        in_family_time = slopes / powers[:, None, None]
+    gradient = basis.adjoint(in_family_time)
     if not problem.free_period:
         return gradient
     last = np.zeros(len(slopes))
     for order in (1, 2, 3):
-        last -= order / factor * np.einsum("mij,ij->m", slopes[:, order], motion.orders[order])
+        along_order = np.einsum("mij,ij->m", slopes[:, order], motion.orders[order])
+        last -= order / factor * along_order
     last[: len(by_duration)] += problem.family.period * by_duration
     return np.concatenate([gradient, last[:, None]], axis=1)

@@ -119,34 +119,42 @@ def one_start(
         evaluations: most, if all of `STAGES` are gone through.
         stages: those to go through, a given start with the whole family in all of them.
     """
-    began, random = time.perf_counter(), isinstance(start, int | np.integer)
-    chosen = tuple(stage if random else stage._replace(coarse=False) for stage in stages)
+    began = time.perf_counter()
+    random = isinstance(start, int | np.integer)
+    chosen = tuple(stages)
+    if not random:
+        chosen = tuple(stage._replace(coarse=False) for stage in stages)
     extra = problem.extra
     run = StartSearch(*_at_stage(problem, chosen[0], extra))
     if random:
-        y = random_start(run.problem, run.basis, np.random.default_rng([seed, int(start)]))
+        generator = np.random.default_rng([seed, int(start)])
+        y = random_start(run.problem, run.basis, generator)
     else:
         y = np.asarray(start, dtype=float)
-        y = np.append(y, np.clip(1.0, *problem.stretch)) if problem.free_period and len(y) == run.basis.p else y
+        if problem.free_period and len(y) == run.basis.p:
+            y = np.append(y, np.clip(1.0, *problem.stretch))
     repair_evaluations = 30  # evaluations to bring a stage's last motion back inside
     max_retries = 3  # of a stage that ends with such a motion
     try:
         for number, stage in enumerate(chosen):
             if number:
                 run, y = run.continued(run.reached(y), *_at_stage(problem, stage, extra))
-            most = max(2, round(evaluations * stage.share))
+            max_evaluations = max(2, round(evaluations * stage.share))
             for retries_left in range(0 if stage.rough else max_retries, -1, -1):
                 run.sharpness = stage.sharpness
-                y = run.solve(run.inside(y), most, method, stage.tolerance)
+                y = run.solve(run.inside(y), max_evaluations, method, stage.tolerance)
                 y = run.repaired(y, repair_evaluations)  # SLSQP travels outside, and may have ended there
-                deep = np.zeros(0) if run.best is None else run.broken(run.best)
+                deep = np.zeros(0)
+                if run.best is not None:
+                    deep = run.broken(run.best)
                 extra = np.union1d(extra, deep)
                 if not len(deep) or not retries_left:
                     break
                 back = run.last_unbroken()
                 run, y = run.continued(run.reached(y), *_at_stage(problem, stage, extra))
                 y = run.repaired(y)
-                y = back if run.least[0] > KEPT else y
+                if run.least[0] > KEPT:
+                    y = back
     except KeyboardInterrupt:
         if run.best is None:
             raise
@@ -154,7 +162,11 @@ def one_start(
     if run.problem.family is not problem.family:  # interrupted before the whole family was looked at
         run, y = run.continued(run.reached(y), problem, problem.basis())
         run.repaired(y)
-    return run.result(y, time.perf_counter() - began, int(start) if random else -1)
+    seconds = time.perf_counter() - began
+    start_number = -1
+    if random:
+        start_number = int(start)
+    return run.result(y, seconds, start_number)
 
 
 def _at_stage(problem: ExcitationProblem, stage: Stage, extra: np.ndarray) -> tuple[ExcitationProblem, Basis]:
@@ -171,17 +183,21 @@ class StartSearch:
     """One start's search in one problem: the state that the optimiser's callbacks share."""
 
     def __init__(self, problem: ExcitationProblem, basis: Basis):
-        self.problem, self.basis = problem, basis
+        self.problem = problem
+        self.basis = basis
         self.sharpness = STAGES[0].sharpness
         self.best: np.ndarray | None = None
         self.nearest: np.ndarray | None = None
-        self.merit, self.least = np.inf, (np.inf, np.inf)
+        self.merit = np.inf
+        self.least = (np.inf, np.inf)
         self.values = np.zeros(0)
         self.history: list[float] = []
         self.times: list[float] = []
         self.began = time.process_time()
         self.count = self.kept = 0
-        self.interrupted, self.reason, self.scale = False, "", 1.0
+        self.interrupted = False
+        self.reason = ""
+        self.scale = 1.0
         self._at: tuple[bytes, tuple[float, float]] | None = None
         self._evaluation: Evaluation | None = None
         self._tried = np.zeros(0)
@@ -189,7 +205,11 @@ class StartSearch:
 
     def reached(self, last: np.ndarray) -> np.ndarray:
         """Return the best feasible point, else the least infeasible, else the last point."""
-        return self.best if self.best is not None else self.nearest if self.nearest is not None else last
+        if self.best is not None:
+            return self.best
+        if self.nearest is not None:
+            return self.nearest
+        return last
 
     def broken(self, y: np.ndarray) -> np.ndarray:
         """Return the times of a motion that breaks limits between samples by more than `max_break`; empty if none."""
@@ -202,7 +222,10 @@ class StartSearch:
         low, high = 0, len(self._trail) - 1
         while high - low > 1:
             middle = (low + high) // 2
-            low, high = (low, middle) if len(self.broken(self._trail[middle])) else (middle, high)
+            if len(self.broken(self._trail[middle])):
+                high = middle
+            else:
+                low = middle
         return self._trail[low]
 
     def continued(self, y: np.ndarray, problem: ExcitationProblem, basis: Basis) -> tuple[StartSearch, np.ndarray]:
@@ -212,22 +235,32 @@ class StartSearch:
             path = self.problem.family.basis(basis.times).motion(y[:p])
             y = np.append(basis.nearest(path.q), y[p:])
         new = StartSearch(problem, basis)
-        new.history, new.times, new.began = self.history, self.times, self.began
-        new.count, new.kept, new.interrupted, new.reason = self.count, self.kept, self.interrupted, self.reason
+        new.history = self.history
+        new.times = self.times
+        new.began = self.began
+        new.count = self.count
+        new.kept = self.kept
+        new.interrupted = self.interrupted
+        new.reason = self.reason
         return new, y
 
     def result(self, y: np.ndarray, seconds: float, seed: int) -> SearchResult | Stuck:
         """Return the result of the search; y: its last point."""
-        p, stretch = self.basis.p, self.problem.stretch
+        p = self.basis.p
+        stretch = self.problem.stretch
         best = self.reached(y)
-        factor = float(best[p]) if self.problem.free_period else stretch[0]
+        if self.problem.free_period:
+            factor = float(best[p])
+        else:
+            factor = stretch[0]
         if self.best is None:
             return Stuck(best[:p], factor, self.least, self.count, self.reason)
         records = list[int]()  # fewer samples may have promised more
         for k, value in enumerate(self.history):
             if value >= self.merit and (not records or value < self.history[records[-1]]):
                 records.append(k)
-        history, times = tuple(self.history[k] for k in records), tuple(self.times[k] for k in records)
+        history = tuple(self.history[k] for k in records)
+        times = tuple(self.times[k] for k in records)
         return SearchResult(
             best[:p],
             factor,
@@ -246,15 +279,21 @@ class StartSearch:
         """Return the evaluation of a point, computed once; remember the best feasible one."""
         key = (y.tobytes(), self.sharpness)
         if self._evaluation is None or key != self._at:
-            self._evaluation, self._at = evaluate(self.problem, self.basis, y, self.sharpness), key
+            self._evaluation = evaluate(self.problem, self.basis, y, self.sharpness)
+            self._at = key
             self.count += 1
             self.remember(np.array(y), self._evaluation)
         return self._evaluation
 
     def remember(self, y: np.ndarray, evaluation: Evaluation) -> None:
         """Keep an evaluated motion if it is within the limits and the best so far, or the nearest to the limits."""
-        missed = unmet(self.problem, evaluation.values) if self.problem.goals else None
-        lacking = (max(evaluation.excess, 0.0), missed[0] if missed else 0.0)
+        missed = None
+        if self.problem.goals:
+            missed = unmet(self.problem, evaluation.values)
+        goal_lacking = 0.0
+        if missed:
+            goal_lacking, *_ = missed
+        lacking = (max(evaluation.excess, 0.0), goal_lacking)
         if lacking < self.least:
             self.least, self.nearest = lacking, y
         if evaluation.excess > KEPT:
@@ -262,7 +301,9 @@ class StartSearch:
         self.kept += 1
         value = merit(self.problem, evaluation.exact)
         if value < self.merit:
-            self.best, self.merit, self.values = y, value, evaluation.exact
+            self.best = y
+            self.merit = value
+            self.values = evaluation.exact
             self._trail.append(y)
             self.history.append(value)
             self.times.append(time.process_time() - self.began)
@@ -300,7 +341,10 @@ class StartSearch:
     def solve(self, y: np.ndarray, evaluations: int, method: Method, tolerance: float = 1e-5) -> np.ndarray:
         """Solve the smoothed problem from y (with goals followed by s, γ = e^s - 1)."""
         goals = self.problem.goals
-        start = np.append(y, self._attainment(y)) if goals else y
+        if goals:
+            start = np.append(y, self._attainment(y))
+        else:
+            start = y
         last = self.count + evaluations
         self.scale = 1.0
         if not goals:  # a slope of at most 1 at the start: the first step is as long as the slope
@@ -309,8 +353,8 @@ class StartSearch:
             self.scale = 1.0 / max(1.0, float(np.linalg.norm(slope)))
         if method == "slsqp":
             return self._by_scipy(start, last, tolerance * self.scale)[: len(y)]
-        named = {"auglag": nlopt.AUGLAG, "mma": nlopt.LD_MMA, "ccsaq": nlopt.LD_CCSAQ}
-        solver = nlopt.opt(named[method], len(start))
+        algorithms = {"auglag": nlopt.AUGLAG, "mma": nlopt.LD_MMA, "ccsaq": nlopt.LD_CCSAQ}
+        solver = nlopt.opt(algorithms[method], len(start))
         if method == "auglag":
             inner = nlopt.opt(nlopt.LD_LBFGS, len(start))
             inner.set_ftol_rel(1e-5)
@@ -332,8 +376,13 @@ class StartSearch:
     def _by_scipy(self, start: np.ndarray, last: int, tolerance: float) -> np.ndarray:
         """Run SciPy's SLSQP (Kraft 1988) up to `last` evaluations; its subproblems are solved faster than in NLopt."""
         self._tried = start
-        rows, size = self._count(start[: len(start) - bool(self.problem.goals)]), len(start)
-        objective = self._last if self.problem.goals else self._sum
+        goal_variables = bool(self.problem.goals)
+        rows = self._count(start[: len(start) - goal_variables])
+        size = len(start)
+        if self.problem.goals:
+            objective = self._last
+        else:
+            objective = self._sum
 
         def value(y: np.ndarray) -> float:
             if self.count >= last:
@@ -347,27 +396,30 @@ class StartSearch:
             return slope
 
         def inequalities(y: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-            found = np.empty(rows)
-            self._rows(found, np.ascontiguousarray(y), slopes)
-            return found
+            values = np.empty(rows)
+            self._rows(values, np.ascontiguousarray(y), slopes)
+            return values
 
         def sloped(y: np.ndarray) -> np.ndarray:
             slopes = np.empty((rows, size))
             inequalities(y, slopes)
             return -slopes
 
-        kept = {"type": "ineq", "fun": lambda y: -inequalities(y, np.empty((0, size))), "jac": sloped}
+        inequality = {"type": "ineq", "fun": lambda y: -inequalities(y, np.empty((0, size))), "jac": sloped}
+        constraints = []
+        if rows:
+            constraints.append(inequality)
         bounds = None
         if self.problem.free_period or self.problem.goals:
             bounds = np.column_stack(self._ends(size))
         try:
-            found = minimize(
+            run = minimize(
                 value,
                 start,
                 method="SLSQP",
                 jac=gradient,
                 bounds=bounds,
-                constraints=[kept] if rows else (),
+                constraints=constraints,
                 options={"maxiter": max(2, last - self.count), "ftol": tolerance},
             )
         except _Spent:
@@ -375,12 +427,15 @@ class StartSearch:
         except NotExciting as error:
             self.reason = str(error)
             return start
-        self.reason = "" if found.success else str(found.message)
-        return found.x
+        self.reason = ""
+        if not run.success:
+            self.reason = str(run.message)
+        return run.x
 
     def _ends(self, size: int) -> tuple[np.ndarray, np.ndarray]:
         """Return bounds of the factor on the period and of s (γ from -0.98 to 10⁵); steps are not limited."""
-        lower, upper = np.full(size, -np.inf), np.full(size, np.inf)
+        lower = np.full(size, -np.inf)
+        upper = np.full(size, np.inf)
         p = self.basis.p
         if self.problem.free_period:
             lower[p], upper[p] = self.problem.stretch
@@ -403,10 +458,10 @@ class StartSearch:
         return start
 
     def _sum(self, y: np.ndarray, slope: np.ndarray) -> float:
-        found = self.at(y)
+        evaluation = self.at(y)
         if slope.size:
-            slope[:] = found.slopes[0] * self.scale
-        return found.total * self.scale
+            slope[:] = evaluation.slopes[0] * self.scale
+        return evaluation.total * self.scale
 
     def _last(self, y: np.ndarray, slope: np.ndarray) -> float:
         if slope.size:
@@ -415,26 +470,38 @@ class StartSearch:
         return float(y[-1])
 
     def _attainment(self, y: np.ndarray) -> float:
-        gammas = [goal.attainment(value) for goal, value in zip(self.problem.goals, self.at(y).values) if goal.share]
-        return float(np.clip(np.log(max(1.0 + max(gammas, default=0.0), 1e-9)), *S_RANGE))
+        values = self.at(y).values
+        gammas = [goal.attainment(value) for goal, value in zip(self.problem.goals, values) if goal.share]
+        largest = max(gammas, default=0.0)
+        s = np.log(max(1.0 + largest, 1e-9))
+        return float(np.clip(s, *S_RANGE))
 
     def _rows(self, result: np.ndarray, y: np.ndarray, slope: np.ndarray) -> None:
         goals = self.problem.goals
-        found = self.at(np.ascontiguousarray(y[:-1]) if goals else y)
-        k, size = len(goals), len(y) - bool(goals)
-        result[k:] = found.constraints
+        point = y
+        if goals:
+            point = np.ascontiguousarray(y[:-1])
+        evaluation = self.at(point)
+        k = len(goals)
+        size = len(y) - bool(goals)
+        result[k:] = evaluation.constraints
         if slope.size:
             slope[:] = 0.0
-            slope[k:, :size] = found.rows
+            slope[k:, :size] = evaluation.rows
         for i, goal in enumerate(goals):
-            value, grow = found.values[i], goal.share * np.exp(y[-1])
+            value = evaluation.values[i]
+            grow = goal.share * np.exp(y[-1])
             bound = goal.goal + grow - goal.share
             if is_condition(goal.objective):
                 bound = max(bound, 1.0)
-                result[i], by_value, by_s = np.log(value / bound), 1.0 / value, -grow / bound
+                result[i] = np.log(value / bound)
+                by_value = 1.0 / value
+                by_s = -grow / bound
             else:
                 size_of = max(abs(goal.goal), 1e-3)
-                result[i], by_value, by_s = (value - bound) / size_of, 1.0 / size_of, -grow / size_of
+                result[i] = (value - bound) / size_of
+                by_value = 1.0 / size_of
+                by_s = -grow / size_of
             if slope.size:
-                slope[i, :size] = by_value * found.slopes[i]
+                slope[i, :size] = by_value * evaluation.slopes[i]
                 slope[i, -1] = by_s

@@ -17,26 +17,40 @@ def random_start(problem: ExcitationProblem, basis: Basis, rng: np.random.Genera
     to the limits of position, velocity, acceleration and jerk.
     """
     n = basis.n
-    boxes = [c for c in problem.constraints if isinstance(c, BoxLimit)]
-    lower, upper = np.full(n, -np.pi), np.full(n, np.pi)
-    for box in (box for box in boxes if box.order == 0):
-        lower, upper = np.maximum(lower, box.lower), np.minimum(upper, box.upper)
-    middle, half = (lower + upper) / 2, (upper - lower) / 2
-    poses = middle + half * rng.uniform(-0.6, 0.6, (200, n))
+    boxes = [constraint for constraint in problem.constraints if isinstance(constraint, BoxLimit)]
+    lower = np.full(n, -np.pi)
+    upper = np.full(n, np.pi)
+    for box in boxes:
+        if box.order == 0:
+            lower = np.maximum(lower, box.lower)
+            upper = np.minimum(upper, box.upper)
+    middle = (lower + upper) / 2
+    half = (upper - lower) / 2
+    shares = rng.uniform(-0.6, 0.6, (200, n))
+    poses = middle + half * shares
     fixed = ~basis.used.any(axis=1)
     poses[:, fixed] = basis.offsets[0, 0, fixed]
     still = np.zeros((200, n))
     resting = SampledMotion(np.arange(200.0), poses, still, still, still)
     excess = np.zeros(200)
-    for constraint in (c for c in problem.constraints if not isinstance(c, BoxLimit)):
-        excess = np.maximum(excess, (constraint.values(resting) / constraint.scale).max(axis=1))
-    centre = poses[np.argmin(np.maximum(excess, -0.1))]
+    for constraint in problem.constraints:
+        if isinstance(constraint, BoxLimit):
+            continue
+        scaled = constraint.values(resting) / constraint.scale
+        excess = np.maximum(excess, scaled.max(axis=1))
+    furthest_inside = np.argmin(np.maximum(excess, -0.1))
+    centre = poses[furthest_inside]
     x = problem.family.random(rng, centre, 0.5 * half)
     constant = problem.family.random(rng, centre, np.zeros(n))
     factor = float(np.mean(problem.stretch))
-    fill = _fitting(boxes, stretched(basis.motion(constant), factor), stretched(basis.motion(x), factor))
-    x = constant + rng.uniform(0.5, 0.9) * fill * (x - constant)
-    return np.append(x, factor) if problem.free_period else x
+    still_motion = stretched(basis.motion(constant), factor)
+    random_motion = stretched(basis.motion(x), factor)
+    fill = _fitting(boxes, still_motion, random_motion)
+    part = rng.uniform(0.5, 0.9) * fill
+    x = constant + part * (x - constant)
+    if problem.free_period:
+        return np.append(x, factor)
+    return x
 
 
 def shrunk(problem: ExcitationProblem, y: np.ndarray, share: float) -> np.ndarray:
@@ -45,19 +59,26 @@ def shrunk(problem: ExcitationProblem, y: np.ndarray, share: float) -> np.ndarra
     path = basis.motion(y[: basis.p])
     still = np.zeros(path.q.shape)
     resting = SampledMotion(path.times, path.q, still, still, still)
-    excess = np.max(
-        [(constraint.values(resting) / constraint.scale).max(axis=1) for constraint in problem.constraints], axis=0
-    )
-    centre = basis.nearest(np.broadcast_to(path.q[np.argmin(excess)], path.q.shape))
-    return np.append(centre + share * (y[: basis.p] - centre), y[basis.p :])
+    scaled = [constraint.values(resting) / constraint.scale for constraint in problem.constraints]
+    excess = np.max([values.max(axis=1) for values in scaled], axis=0)
+    pose = path.q[np.argmin(excess)]
+    centre = basis.nearest(np.broadcast_to(pose, path.q.shape))
+    x = y[: basis.p]
+    smaller = centre + share * (x - centre)
+    return np.append(smaller, y[basis.p :])
 
 
 def _fitting(boxes: list[BoxLimit], still: SampledMotion, moving: SampledMotion) -> float:
     """Return the largest share (at most 1) of a motion about a pose inside the box limits."""
     share = 1.0
     for box in boxes:
-        at, move = still.orders[box.order], moving.orders[box.order] - still.orders[box.order]
+        at = still.orders[box.order]
+        move = moving.orders[box.order] - at
         with np.errstate(divide="ignore", invalid="ignore"):
-            room = np.where(move > 0, (box.upper - at) / move, np.where(move < 0, (box.lower - at) / move, np.inf))
-        share = min(share, float(np.nanmin(np.maximum(room, 0.02))))
+            to_upper = (box.upper - at) / move
+            to_lower = (box.lower - at) / move
+            falling = np.where(move < 0, to_lower, np.inf)
+            room = np.where(move > 0, to_upper, falling)
+        fitting = float(np.nanmin(np.maximum(room, 0.02)))
+        share = min(share, fitting)
     return share

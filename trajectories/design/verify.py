@@ -71,7 +71,8 @@ class Verification:
 
 def dense_motion(family: Family, x: np.ndarray, times: np.ndarray, factor: float = 1.0) -> SampledMotion:
     """Return the time-scaled motion sampled at times [s], evaluated by the family's formula."""
-    orders = [family.evaluate(x, times / factor, order) / factor**order for order in range(4)]
+    family_times = times / factor
+    orders = [family.evaluate(x, family_times, order) / factor**order for order in range(4)]
     return SampledMotion(times, *orders)
 
 
@@ -87,8 +88,12 @@ def verify_motion(
     step = period / instants
     times = step * np.arange(instants + 1)
     motion = dense_motion(family, x, times, factor)
-    margins = [margin for constraint in constraints for margin in _margins(family, x, constraint, motion, step, factor)]
-    return Verification(tuple(margins), instants, (float(np.abs(motion.v[0]).max()), float(np.abs(motion.a[0]).max())))
+    margins = []
+    for constraint in constraints:
+        margins += _margins(family, x, constraint, motion, step, factor)
+    velocity_at_start = float(np.abs(motion.v[0]).max())
+    acceleration_at_start = float(np.abs(motion.a[0]).max())
+    return Verification(tuple(margins), instants, (velocity_at_start, acceleration_at_start))
 
 
 def ensured(
@@ -110,7 +115,9 @@ def ensured(
     Raises:
         NothingFeasible: where none of that helps.
     """
-    checked, tighter, original = constraints or problem.constraints, problem, result
+    checked = constraints or problem.constraints
+    tighter = problem
+    original = result
 
     def verified(x: np.ndarray) -> Verification:
         return verify_motion(problem.family, x, checked, factor=result.factor, instants=instants)
@@ -120,13 +127,20 @@ def ensured(
     for _ in range(rounds):
         if report.feasible:
             return result, report
-        y = np.append(result.x, result.factor) if problem.free_period else result.x
-        lacking = np.array([max(-report.worst[margin.name].share, 0.0) for margin in checked])
-        further = np.where(lacking > 0.0, np.minimum(1.2 * lacking, 0.01) + 1e-4, 0.0)  # our choice
-        extra = np.union1d(tighter.extra, critical_times(problem, y, 0.0, checked, instants))
+        y = result.x
+        if problem.free_period:
+            y = np.append(y, result.factor)
+        shares = [report.worst[margin.name].share for margin in checked]
+        lacking = np.array([max(-share, 0.0) for share in shares])
+        # our choice
+        step_inside = np.minimum(1.2 * lacking, 0.01) + 1e-4
+        further = np.where(lacking > 0.0, step_inside, 0.0)
+        critical = critical_times(problem, y, 0.0, checked, instants)
+        extra = np.union1d(tighter.extra, critical)
         tighter = replace(tighter, extra=extra, tightening=tighter.tightening + further)
         continued = one_start(tighter, max_evaluations, "slsqp", result.seed, y, STAGES[2:])
-        result = replace(result, evaluations=result.evaluations + continued.evaluations)
+        evaluations = result.evaluations + continued.evaluations
+        result = replace(result, evaluations=evaluations)
         if isinstance(continued, SearchResult):
             result = replace(
                 continued,
@@ -155,15 +169,23 @@ def _margins(
 ) -> list[Margin]:
     block = 2000
     starts = range(0, len(motion), block)
-    values = np.concatenate([constraint.values(motion.part(np.arange(len(motion))[s : s + block])) for s in starts])
+    blocks = []
+    for start in starts:
+        rows = np.arange(len(motion))[start : start + block]
+        blocks.append(constraint.values(motion.part(rows)))
+    values = np.concatenate(blocks)
     proved = isinstance(constraint, BoxLimit)
     if isinstance(constraint, BoxLimit):
-        curve = family.largest(x, constraint.order + 2) / factor ** (constraint.order + 2)
-        allowance = np.broadcast_to(np.tile(curve[constraint.joints], 2) * step**2 / 8, values.shape)
+        order = constraint.order + 2
+        curve = family.largest(x, order) / factor**order
+        both_sides = np.tile(curve[constraint.joints], 2)
+        allowance = np.broadcast_to(both_sides * step**2 / 8, values.shape)
     else:
         bend = np.abs(np.diff(values, 2, axis=0))
         bend = np.concatenate([bend[-1:], bend, bend[:1]])  # periodic
-        allowance = np.maximum(bend, np.maximum(np.roll(bend, 1, 0), np.roll(bend, -1, 0))) / 4
+        before = np.roll(bend, 1, 0)
+        behind = np.roll(bend, -1, 0)
+        allowance = np.maximum(bend, np.maximum(before, behind)) / 4
     reached = values + allowance
     rows = np.argmax(reached, axis=0)
     result = []

@@ -37,6 +37,7 @@ class TimingLimits:
             if values.shape != np.shape(self.velocity) or values.ndim != 1:
                 raise BadInput(f"{name} limits: expected one per joint, found shape {values.shape}")
             if not (values > 0).all():
-                j = int(np.argmin(np.where(np.isnan(values), -np.inf, values)))
+                below_if_nan = np.where(np.isnan(values), -np.inf, values)
+                j = int(np.argmin(below_if_nan))
                 raise BadInput(f"{name} limit of joint {j + 1} is {values[j]:g}: it must be above zero")
             object.__setattr__(self, name, values)

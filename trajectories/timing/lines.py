@@ -58,11 +58,16 @@ def line(forward: Forward, jacobian: Forward, start: np.ndarray, goal: np.ndarra
     while True:
         share = np.linspace(0, 1, count)
         q = _follow(forward, jacobian, start, _targets(first, goal, share))
-        length = np.linalg.norm(np.diff(q, axis=0), axis=1).sum()
+        chords = np.linalg.norm(np.diff(q, axis=0), axis=1)
+        length = chords.sum()
         path = through(q, share * length)
         between = (share[1:] + share[:-1]) / 2
-        error = np.abs(_error(forward(path(between * length)), _targets(first, goal, between)))
-        deviation = np.array([np.linalg.norm(error[:, :3], axis=1).max(), np.linalg.norm(error[:, 3:], axis=1).max()])
+        targets = _targets(first, goal, between)
+        reached = forward(path(between * length))
+        error = np.abs(_error(reached, targets))
+        position = np.linalg.norm(error[:, :3], axis=1)
+        turn = np.linalg.norm(error[:, 3:], axis=1)
+        deviation = np.array([position.max(), turn.max()])
         if deviation.max() <= KEPT or 2 * count > MAX_SAMPLES:
             return _Line(path, deviation)
         count = 2 * count - 1
@@ -70,11 +75,13 @@ def line(forward: Forward, jacobian: Forward, start: np.ndarray, goal: np.ndarra
 
 def _follow(forward: Forward, jacobian: Forward, start: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """Return joint values (m, n) at the targets (m, 4, 4), solved one after the other."""
-    q, profile = start.copy(), [start]
+    q = start.copy()
+    profile = [start]
     for k, target in enumerate(targets[1:], 1):
         q, error = _reach(forward, jacobian, q, start, target)
         if not np.abs(error).max() <= REACHED:
-            short, turn = float(np.linalg.norm(error[:3])), float(np.linalg.norm(error[3:]))
+            short = float(np.linalg.norm(error[:3]))
+            turn = float(np.linalg.norm(error[3:]))
             raise NothingFeasible(
                 f"no tool line: at {k / (len(targets) - 1):.0%} of it the arm stays {1e3 * short:.3g} mm and "
                 f"{np.degrees(turn):.3g} deg short (out of reach, or the elbow must flip); take waypoints closer "
@@ -94,26 +101,35 @@ def _reach(forward: Forward, jacobian: Forward, q: np.ndarray, remaining: np.nda
     for _ in range(STEPS):
         error = _error(forward(q[None]), target[None])[0]
         J = jacobian(q[None])[0]
-        damping = min(1e-2 * float(error @ error), 1e-2) + 1e-14
-        inverse = J.T @ np.linalg.inv(J @ J.T + damping * np.eye(6))
+        squared_error = float(error @ error)
+        damping = min(1e-2 * squared_error, 1e-2) + 1e-14
+        damped = J @ J.T + damping * np.eye(6)
+        inverse = J.T @ np.linalg.inv(damped)
         pull = remaining - q
         step = inverse @ error + pull - inverse @ (J @ pull)
         size = np.abs(step).max()
         q = q + step * min(1.0, max_step / max(size, 1e-300))
         if size <= 1e-11:
             break
-    return q, _error(forward(q[None]), target[None])[0]
+    error = _error(forward(q[None]), target[None])[0]
+    return q, error
 
 
 def _targets(first: np.ndarray, goal: np.ndarray, share: np.ndarray) -> np.ndarray:
-    turn = Rotation.from_matrix(first[:3, :3].T @ goal[:3, :3]).as_rotvec()
+    rotation = first[:3, :3].T @ goal[:3, :3]
+    turn = Rotation.from_matrix(rotation).as_rotvec()
     poses = np.tile(np.eye(4), (len(share), 1, 1))
-    poses[:, :3, 3] = first[:3, 3] + share[:, None] * (goal[:3, 3] - first[:3, 3])
-    poses[:, :3, :3] = first[:3, :3] @ Rotation.from_rotvec(share[:, None] * turn).as_matrix()
+    start = first[:3, 3]
+    end = goal[:3, 3]
+    poses[:, :3, 3] = start + share[:, None] * (end - start)
+    turns = Rotation.from_rotvec(share[:, None] * turn).as_matrix()
+    poses[:, :3, :3] = first[:3, :3] @ turns
     return poses
 
 
 def _error(poses: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """Return [Δp; Δφ] (m, 6) in the base frame, from poses to targets."""
-    turn = Rotation.from_matrix(targets[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1)).as_rotvec()
-    return np.concatenate([targets[:, :3, 3] - poses[:, :3, 3], turn], axis=1)
+    rotations = targets[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1)
+    turn = Rotation.from_matrix(rotations).as_rotvec()
+    shift = targets[:, :3, 3] - poses[:, :3, 3]
+    return np.concatenate([shift, turn], axis=1)

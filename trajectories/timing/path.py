@@ -60,18 +60,26 @@ def spline(waypoints: np.ndarray, spacing: np.ndarray | None = None, scale: np.n
         BadInput: for fewer than two waypoints, equal neighbours, or values that are no numbers.
     """
     points = checked(waypoints)
-    chords = np.linalg.norm(np.diff(points, axis=0) / (1.0 if scale is None else scale), axis=1)
-    factors = np.ones(len(chords)) if spacing is None else np.asarray(spacing, dtype=float)
+    steps = np.diff(points, axis=0)
+    if scale is not None:
+        steps = steps / scale
+    chords = np.linalg.norm(steps, axis=1)
+    if spacing is None:
+        factors = np.ones(len(chords))
+    else:
+        factors = np.asarray(spacing, dtype=float)
     if factors.shape != chords.shape or not (np.isfinite(factors) & (factors > 0)).all():
         raise BadInput(f"spacing of the knots: expected {len(chords)} numbers above zero, found {spacing}")
-    knots = np.append(0.0, np.cumsum(chords * factors))
+    knot_spacing = np.cumsum(chords * factors)
+    knots = np.append(0.0, knot_spacing)
     return Path(CubicSpline(knots, points, bc_type="natural"), knots)
 
 
 def through(samples: np.ndarray, s: np.ndarray) -> Path:
     """Return the quintic spline (C⁴) through dense samples (N, n) of a curve at parameters s (N,), rising from 0."""
     points = checked(samples)
-    curve = make_interp_spline(s, points, k=min(5, len(points) - 1 - len(points) % 2))
+    degree = min(5, len(points) - 1 - len(points) % 2)
+    curve = make_interp_spline(s, points, k=degree)
     return Path(curve, np.asarray(s, dtype=float))
 
 
@@ -81,7 +89,9 @@ def checked(waypoints: np.ndarray) -> np.ndarray:
     if points.ndim != 2 or not points.shape[1]:
         raise BadInput(f"waypoints: expected an (m, n) array of joint values, found shape {points.shape}")
     if not np.isfinite(points).all():
-        row, joint = (int(k) for k in np.argwhere(~np.isfinite(points))[0])
+        bad_rows, bad_joints = np.nonzero(~np.isfinite(points))
+        row = int(bad_rows[0])
+        joint = int(bad_joints[0])
         raise BadInput(f"waypoint {row + 1}, joint {joint + 1} is not a number ({points[row, joint]})")
     if len(points) < 2:
         raise BadInput(f"{len(points)} waypoint: a path needs two or more (the first is the start)")
@@ -123,7 +133,8 @@ def extremes(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return the path parameters of each joint's minimum and maximum, and the values there, two arrays (2, n)."""
     spans = len(path.knots) - 1
     samples = 40  # samples per knot interval where extremes are looked for
-    s = np.interp(np.linspace(0, spans, samples * spans + 1), np.arange(spans + 1), path.knots)
+    positions = np.linspace(0, spans, samples * spans + 1)
+    s = np.interp(positions, np.arange(spans + 1), path.knots)
     s = np.concatenate([s, reversals(path, s)])
     q = path(s)
     peaks = np.array([q.argmin(axis=0), q.argmax(axis=0)])
@@ -134,10 +145,13 @@ def reversals(path: Path, s: np.ndarray) -> np.ndarray:
     """Return the path parameters where joints reverse between samples s (N,): zeros of Φ'_j, by bisection."""
     slope = path(s, 1)
     k, j = np.nonzero(slope[:-1] * slope[1:] < 0)
-    low, high, rising = s[k], s[k + 1], slope[k + 1, j] > 0
+    low = s[k]
+    high = s[k + 1]
+    rising = slope[k + 1, j] > 0
     rows = np.arange(len(k))
     for _ in range(50 if len(k) else 0):
         middle = (low + high) / 2
         beyond = (path(middle, 1)[rows, j] > 0) == rising
-        low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
+        low = np.where(beyond, low, middle)
+        high = np.where(beyond, middle, high)
     return (low + high) / 2

@@ -29,13 +29,16 @@ class Profile:
     @property
     def u(self) -> np.ndarray:
         """Path acceleration s̈ (K,) between grid points: Δx / (2 Δs)."""
-        return np.diff(self.x) / (2 * np.diff(self.s))
+        steps = np.diff(self.s)
+        return np.diff(self.x) / (2 * steps)
 
     @property
     def times(self) -> np.ndarray:
         """Times (K + 1,) of the grid points [s]: Δt = 2 Δs / (ṡ_k + ṡ_{k+1})."""
         speed = np.sqrt(self.x)
-        return np.append(0.0, np.cumsum(2 * np.diff(self.s) / (speed[:-1] + speed[1:])))
+        summed_speeds = speed[:-1] + speed[1:]
+        durations = 2 * np.diff(self.s) / summed_speeds
+        return np.append(0.0, np.cumsum(durations))
 
     @property
     def duration(self) -> float:
@@ -48,10 +51,15 @@ class Profile:
     def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return s, ṡ, s̈, each (N,), at times [s]."""
         starts = self.times
-        k = np.clip(np.searchsorted(starts, times, side="right") - 1, 0, len(self.s) - 2)
-        since, speed, u = times - starts[k], np.sqrt(self.x[k]), self.u[k]
-        s = np.minimum(self.s[k] + since * (speed + since * u / 2), self.s[k + 1])
-        return s, np.maximum(speed + since * u, 0.0), u
+        interval = np.searchsorted(starts, times, side="right") - 1
+        k = np.clip(interval, 0, len(self.s) - 2)
+        since = times - starts[k]
+        speed = np.sqrt(self.x[k])
+        u = self.u[k]
+        travelled = since * (speed + since * u / 2)
+        s = np.minimum(self.s[k] + travelled, self.s[k + 1])
+        reached_speed = np.maximum(speed + since * u, 0.0)
+        return s, reached_speed, u
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,21 +86,30 @@ def dense(path: Path, profile: Profile, torque: TorqueLaw | None, per_interval: 
     At rest friction takes the direction of the motion that begins or ends there: the larger torque.
     """
     share = np.linspace(1e-6, 1 - 1e-6, per_interval)
-    s = profile.s[:-1, None] + share * np.diff(profile.s)[:, None]
-    x = profile.x[:-1, None] + share * np.diff(profile.x)[:, None]
-    speed = np.sqrt(np.maximum(x, MIN_SPEED_SHARE**2 * profile.x.max()))
+    steps = np.diff(profile.s)[:, None]
+    s = profile.s[:-1, None] + share * steps
+    changes = np.diff(profile.x)[:, None]
+    x = profile.x[:-1, None] + share * changes
+    min_x = MIN_SPEED_SHARE**2 * profile.x.max()
+    speed = np.sqrt(np.maximum(x, min_x))
     trapezoid = np.ones(per_interval)
     trapezoid[[0, -1]] = 0.5
-    weights = np.diff(profile.times)[:, None] * trapezoid / (per_interval - 1)
+    durations = np.diff(profile.times)[:, None]
+    weights = durations * trapezoid / (per_interval - 1)
     u = np.repeat(profile.u, per_interval)
     q, v, a = moved(path, s.ravel(), speed.ravel(), u)
-    return Sampled(s.ravel(), weights.ravel(), q, v, a, None if torque is None else torque(q, v, a))
+    tau = None
+    if torque is not None:
+        tau = torque(q, v, a)
+    return Sampled(s.ravel(), weights.ravel(), q, v, a, tau)
 
 
 def moved(path: Path, s: np.ndarray, speed: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the motion q = Φ, v = Φ' ṡ, a = Φ' s̈ + Φ'' ṡ², each (N, n)."""
     slope = path(s, 1)
-    return path(s), slope * speed[:, None], slope * u[:, None] + path(s, 2) * (speed**2)[:, None]
+    velocity = slope * speed[:, None]
+    acceleration = slope * u[:, None] + path(s, 2) * (speed**2)[:, None]
+    return path(s), velocity, acceleration
 
 
 def track(path: Path, profile: Profile, rate: float, torque: TorqueLaw | None = None) -> Setpoints:
@@ -108,4 +125,6 @@ def track(path: Path, profile: Profile, rate: float, torque: TorqueLaw | None = 
     if torque is None:
         return Setpoints(rate, q, v, a)
     barely = np.maximum(speed, MIN_SPEED_SHARE * speed.max())
-    return Setpoints(rate, q, v, a, torque(q, path(s, 1) * barely[:, None], a))
+    along = path(s, 1) * barely[:, None]
+    tau = torque(q, along, a)
+    return Setpoints(rate, q, v, a, tau)

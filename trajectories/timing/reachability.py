@@ -58,23 +58,33 @@ class ConstraintRows:
     def of(cls, path: Path, s: np.ndarray, limits: TimingLimits, law: Law | None) -> ConstraintRows:
         steps = np.diff(s)
         inset = 1e-6  # of an interval: rows of an end are taken just inside it
-        ends = np.concatenate([s[:-1] + inset * steps, s[1:] - inset * steps])
+        inset_steps = inset * steps
+        starts_inside = s[:-1] + inset_steps
+        ends_inside = s[1:] - inset_steps
+        ends = np.concatenate([starts_inside, ends_inside])
         shape = (2, len(steps), path.n)
         geometry = [path(ends, order) for order in range(3)]
-        dynamics = [np.zeros_like(geometry[0])] * 3 if law is None else list(law.along(*geometry))
-        q, slope, curvature, A, B, G = (x.reshape(shape) for x in (*geometry, *dynamics))
+        dynamics = [np.zeros_like(geometry[0])] * 3
+        if law is not None:
+            dynamics = list(law.along(*geometry))
+        both_ends = [values.reshape(shape) for values in (*geometry, *dynamics)]
+        q, slope, curvature, A, B, G = both_ends
         return cls(s, q, slope, curvature, A, B, G, limits)
 
     def speed(self, fastest_joint: float) -> float:
         """Return the x = ṡ² up to which no joint exceeds a speed [rad/s or m/s] anywhere."""
-        return (fastest_joint / np.abs(self.slope).max()) ** 2
+        steepest = np.abs(self.slope).max()
+        return (fastest_joint / steepest) ** 2
 
     def top(self, tight: np.ndarray) -> np.ndarray:
         """Return the largest x (K + 1,) that the velocity limits allow: min_j (v_max / Φ')²."""
         with np.errstate(divide="ignore"):
-            ends = ((self.limits.velocity * tight / np.abs(self.slope)) ** 2).min(axis=2)
+            max_speeds = self.limits.velocity * tight / np.abs(self.slope)
+            ends = (max_speeds**2).min(axis=2)
         max_speed = 100.0  # [rad/s or m/s] of the fastest joint: a bound where no joint has a velocity limit
-        return np.minimum(np.minimum(np.append(ends[0], np.inf), np.append(np.inf, ends[1])), self.speed(max_speed))
+        by_left = np.append(ends[0], np.inf)
+        by_right = np.append(np.inf, ends[1])
+        return np.minimum(np.minimum(by_left, by_right), self.speed(max_speed))
 
     def bounded(self, friction: tuple[np.ndarray, np.ndarray], tight: Mapping[str, np.ndarray]) -> _Bounded:
         """Return the rows as shares of the limits.
@@ -83,14 +93,14 @@ class ConstraintRows:
             friction: slope and value (2, K, n) of friction as a line in x.
             tight: (K, n) by kind of limit, the share of it that may be used on each interval.
         """
-        pushing, turning = np.isfinite(self.limits.torque), np.isfinite(self.limits.acceleration)
+        pushing = np.isfinite(self.limits.torque)
+        turning = np.isfinite(self.limits.acceleration)
         torque = (self.limits.torque * tight["torque"])[:, pushing]
         bend = (self.limits.acceleration * tight["acceleration"])[:, turning]
-        parts = (
-            (self.A, self.slope),
-            (self.B + friction[0], self.curvature),
-            (self.G + friction[1], np.zeros_like(self.q)),
-        )
+        friction_slope, friction_value = friction
+        by_x = self.B + friction_slope
+        constant = self.G + friction_value
+        parts = ((self.A, self.slope), (by_x, self.curvature), (constant, np.zeros_like(self.q)))
         a, b, c = (
             np.concatenate([torque_part[..., pushing] / torque, bend_part[..., turning] / bend], axis=2)
             for torque_part, bend_part in parts
@@ -114,24 +124,33 @@ class ConstraintRows:
         if x is None:
             value = self._rubbing(law, creep, 0.0)
             return np.zeros_like(self.q), value.reshape(self.q.shape)
-        u = np.tile(np.diff(x) / (2 * np.diff(self.s)), 2)
+        both_steps = 2 * np.diff(self.s)
+        u = np.tile(np.diff(x) / both_steps, 2)
         max_change = 0.1  # relative, of x in two rounds, from where on the tangent is taken
-        settled = np.zeros(len(x), dtype=bool) if before is None else np.abs(x - before) <= max_change * x
+        settled = np.zeros(len(x), dtype=bool)
+        if before is not None:
+            settled = np.abs(x - before) <= max_change * x
         tangent = np.concatenate([settled[:-1], settled[1:]])
-        speeds = np.maximum(np.concatenate([x[:-1], x[1:]]), 2 * creep)
+        speeds_at_ends = np.concatenate([x[:-1], x[1:]])
+        speeds = np.maximum(speeds_at_ends, 2 * creep)
         difference = 1e-3  # relative, of the difference that gives a tangent
-        low, high = (
-            np.where(tangent, (1 - difference) * speeds, creep),
-            np.where(tangent, (1 + difference) * speeds, speeds),
-        )
-        below, above = (self._rubbing(law, speed, u) for speed in (low, high))
+        low = np.where(tangent, (1 - difference) * speeds, creep)
+        high = np.where(tangent, (1 + difference) * speeds, speeds)
+        below = self._rubbing(law, low, u)
+        above = self._rubbing(law, high, u)
         slope = (above - below) / (high - low)[:, None]
-        return slope.reshape(self.q.shape), (below - slope * low[:, None]).reshape(self.q.shape)
+        value = below - slope * low[:, None]
+        return slope.reshape(self.q.shape), value.reshape(self.q.shape)
 
     def _rubbing(self, law: Law, x: np.ndarray, u: np.ndarray | float) -> np.ndarray:
-        q, slope, curvature = (y.reshape(-1, y.shape[2]) for y in (self.q, self.slope, self.curvature))
+        n = self.q.shape[2]
+        q = self.q.reshape(-1, n)
+        slope = self.slope.reshape(-1, n)
+        curvature = self.curvature.reshape(-1, n)
         pull = np.broadcast_to(u, x.shape)[:, None]
-        return law.friction(q, slope * np.sqrt(x)[:, None], slope * pull + curvature * x[:, None])
+        velocity = slope * np.sqrt(x)[:, None]
+        acceleration = slope * pull + curvature * x[:, None]
+        return law.friction(q, velocity, acceleration)
 
 
 def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
@@ -151,7 +170,9 @@ def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
         )
     x = np.zeros(len(s))
     for k, step in enumerate(np.diff(s)):
-        x[k + 1] = min(max(x[k] + 2 * step * _largest(rows, k, x[k], step), 0.0), controllable[k + 1])
+        u = _largest(rows, k, x[k], step)
+        reached = max(x[k] + 2 * step * u, 0.0)
+        x[k + 1] = min(reached, controllable[k + 1])
     x[-1] = 0.0
     if (x[1:-1] <= 0).any():
         k = int(np.argmax(x[1:-1] <= 0)) + 1
@@ -166,11 +187,16 @@ def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
 
 def _largest(rows: _Bounded, k: int, x: float, step: float) -> float:
     """Return the largest u on interval k at speed x."""
-    a = np.concatenate([rows.a[0, k], rows.a[1, k] + 2 * step * rows.b[1, k]])
-    constant = np.concatenate([rows.b[0, k] * x + rows.c[0, k], rows.b[1, k] * x + rows.c[1, k]])
+    right = rows.a[1, k] + 2 * step * rows.b[1, k]
+    a = np.concatenate([rows.a[0, k], right])
+    left_constant = rows.b[0, k] * x + rows.c[0, k]
+    right_constant = rows.b[1, k] * x + rows.c[1, k]
+    constant = np.concatenate([left_constant, right_constant])
     with np.errstate(divide="ignore", invalid="ignore"):
-        upper = np.where(a == 0, np.inf, (np.sign(a) - constant) / a)
-    return float(min(upper.min(initial=np.inf), (rows.top[k + 1] - x) / (2 * step)))
+        quotients = (np.sign(a) - constant) / a
+        upper = np.where(a == 0, np.inf, quotients)
+    to_top = (rows.top[k + 1] - x) / (2 * step)
+    return float(min(upper.min(initial=np.inf), to_top))
 
 
 def _controllable(rows: _Bounded, s: np.ndarray) -> np.ndarray:
@@ -184,8 +210,10 @@ def _controllable(rows: _Bounded, s: np.ndarray) -> np.ndarray:
         raise BadInput(
             "timing needs toppra: pip install toppra (on macOS and Windows it builds from source)"
         ) from error
-    size = np.abs(rows.b).max(axis=(0, 2), initial=1e-12)
-    unit = float(np.median(np.minimum(rows.top[1:], 2.0 / size)))
+    sizes = np.abs(rows.b)
+    size = sizes.max(axis=(0, 2), initial=1e-12)
+    typical = np.minimum(rows.top[1:], 2.0 / size)
+    unit = float(np.median(typical))
     scaled = _Bounded(unit * rows.a, unit * rows.b, rows.c, rows.top / unit)
     quiet = logging.getLogger("toppra")
     level = quiet.level
@@ -195,7 +223,9 @@ def _controllable(rows: _Bounded, s: np.ndarray) -> np.ndarray:
         ranges: Any = solver.compute_controllable_sets(0.0, 0.0)
     finally:
         quiet.setLevel(level)
-    return unit * np.where(ranges[:, 0] > ranges[:, 1], np.nan, ranges[:, 1])
+    lowest = ranges[:, 0]
+    highest = ranges[:, 1]
+    return unit * np.where(lowest > highest, np.nan, highest)
 
 
 class _Interval:
@@ -213,7 +243,8 @@ def _constraint(rows: _Bounded, s: np.ndarray) -> Any:
     from toppra.constraint import LinearConstraint
 
     steps = np.diff(s)[:, None]
-    a = np.concatenate([rows.a[0], rows.a[1] + 2 * steps * rows.b[1]], axis=1)
+    right = rows.a[1] + 2 * steps * rows.b[1]
+    a = np.concatenate([rows.a[0], right], axis=1)
     b = np.concatenate([rows.b[0], rows.b[1]], axis=1)
     c = np.concatenate([rows.c[0], rows.c[1]], axis=1)
     m = a.shape[1]

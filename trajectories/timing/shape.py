@@ -42,20 +42,27 @@ class Shaped:
 def count(waypoints: np.ndarray, stray: float) -> int:
     """Return the number of path parameters φ."""
     m, n = np.shape(waypoints)
-    return m - 2 + ((m - 1) * n if stray > 0 else 0)
+    parameters = m - 2
+    if stray > 0:
+        parameters += (m - 1) * n
+    return parameters
 
 
 def build(waypoints: np.ndarray, phi: np.ndarray, stray: float = 0.0) -> Path:
     """Return the path of parameters φ: log ratios of knot intervals, then offsets of the via points over `stray`."""
     points = checked(waypoints)
     m, n = points.shape
-    factors = RATIO ** np.append(0.0, np.asarray(phi)[: m - 2])
+    ratios = np.asarray(phi)[: m - 2]
+    factors = RATIO ** np.append(0.0, ratios)
     if stray <= 0:
         return spline(points, factors)
     first = spline(points)
-    middle = first((first.knots[:-1] + first.knots[1:]) / 2) + stray * np.reshape(phi[m - 2 :], (m - 1, n))
+    middles = (first.knots[:-1] + first.knots[1:]) / 2
+    offsets = np.reshape(phi[m - 2 :], (m - 1, n))
+    middle = first(middles) + stray * offsets
     pieces = np.empty((2 * m - 1, n))
-    pieces[::2], pieces[1::2] = points, middle
+    pieces[::2] = points
+    pieces[1::2] = middle
     return spline(pieces, np.repeat(factors, 2))
 
 
@@ -80,7 +87,8 @@ def shorten(
     p = count(waypoints, stray)
     first = build(waypoints, np.zeros(p), stray)
     before = timer(first)
-    best, tally = [before, np.zeros(p)], [1, 0]
+    best = [before, np.zeros(p)]
+    tally = [1, 0]
 
     def duration(phi: np.ndarray, _: np.ndarray) -> float:
         tally[0] += 1
@@ -109,4 +117,6 @@ def shorten(
             pass
         except nlopt.RoundoffLimited:
             pass
-    return Shaped(build(waypoints, best[1], stray), best[1], before, best[0], tally[0], tally[1])
+    shortest, phi = best
+    timed, refused = tally
+    return Shaped(build(waypoints, phi, stray), phi, before, shortest, timed, refused)

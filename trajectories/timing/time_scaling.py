@@ -71,9 +71,11 @@ class Timing:
     @property
     def active_share(self) -> float:
         """Share of the time in which at least one limit is reached within `ACTIVE`."""
-        largest = np.max([values.max(axis=1) for values in self.used.values()], axis=0)
+        largest_by_kind = [values.max(axis=1) for values in self.used.values()]
+        largest = np.max(largest_by_kind, axis=0)
         weights = self.sampled.weights
-        return float(weights @ (largest >= 1 - ACTIVE) / weights.sum())
+        is_active = largest >= 1 - ACTIVE
+        return float(weights @ is_active / weights.sum())
 
 
 def time_optimal(
@@ -162,9 +164,11 @@ def _round(
 ) -> Profile:
     """Return the fastest profile with linearised friction; by secants only if tangents make it infeasible."""
     try:
-        return fastest(rows.bounded(rows.friction(law, x, before), tight), rows.s)
+        bounded = rows.bounded(rows.friction(law, x, before), tight)
+        return fastest(bounded, rows.s)
     except NothingFeasible:
-        return fastest(rows.bounded(rows.friction(law, x, None), tight), rows.s)
+        bounded = rows.bounded(rows.friction(law, x, None), tight)
+        return fastest(bounded, rows.s)
 
 
 def _shares(sampled: Sampled, limits: TimingLimits) -> dict[str, np.ndarray]:
@@ -186,7 +190,9 @@ def _check_holding(path: Path, limits: TimingLimits, law: Law, s: np.ndarray) ->
 
     A motion that swings through such a place can exist; it could not be stopped there, nor rehearsed (our choice).
     """
-    q, v, _ = moved(path, s, np.full(len(s), 1e-9), np.zeros(len(s)))
+    slow_speed = np.full(len(s), 1e-9)
+    no_acceleration = np.zeros(len(s))
+    q, v, _ = moved(path, s, slow_speed, no_acceleration)
     still = np.zeros_like(q)
     gravity = law.torque(q, still, still)
     slow = gravity + law.friction(q, v, still)
@@ -211,7 +217,8 @@ def _grid_points(path: Path, count: int | None = None) -> np.ndarray:
         count: intervals; None: `GRID`, or `PER_SPAN` between knots where these are many.
     """
     if not count:
-        count = int(np.clip(PER_SPAN * (len(path.knots) - 1), GRID, MAX_INTERVALS))
+        intervals = PER_SPAN * (len(path.knots) - 1)
+        count = int(np.clip(intervals, GRID, MAX_INTERVALS))
     even = np.linspace(0, 1, count + 1)
     s = path.length * (1 - np.cos(np.pi * even)) / 2
     extra = reversals(path, s)
@@ -220,20 +227,23 @@ def _grid_points(path: Path, count: int | None = None) -> np.ndarray:
     interior = (extra > 0) & (extra < path.length)
     s = np.unique(np.concatenate([s, extra[interior]]))
     # without intervals of rounding
-    s = s[np.append(True, np.diff(s) > 1e-7 * path.length)]
+    is_wide = np.append(True, np.diff(s) > 1e-7 * path.length)
+    s = s[is_wide]
     return np.append(s[:-1], path.length)
 
 
 def _whole(duration: float, rate: float) -> float:
     """Return the factor ≥ 1 that makes a duration a whole number of samples."""
-    return np.ceil(duration * rate - 1e-9) / (duration * rate)
+    samples = duration * rate
+    return np.ceil(samples - 1e-9) / samples
 
 
 def _not_settled(excess: dict[str, np.ndarray]) -> NothingFeasible:
     """Return the error on the limit that is exceeded most."""
     name = max(excess, key=lambda key: float(excess[key].max()))
     worst = float(excess[name].max())
-    j = int(excess[name].max(axis=0).argmax())
+    by_joint = excess[name].max(axis=0)
+    j = int(by_joint.argmax())
     return NothingFeasible(
         f"the timing did not converge: the {name} of joint {j + 1} exceeds its limit by {worst:.2g} of it between grid "
         "points; try a path with gentler bends, or more grid points",

@@ -6,7 +6,6 @@ import numpy as np
 
 from calib import files
 from calib.apps.cell_demo.summary import PICTURE
-from calib.apps.viewer import scene
 from calib.procedure.export.delivery import prediction
 from calib.procedure.report import fit_report
 from calib.procedure.report.charts import Chart, Panel, line, picture, text
@@ -15,6 +14,7 @@ from calib.procedure.report.style import AFTER, BEFORE, BROWN, INK, QUIET
 from calib.procedure.session.folder import Session
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.results import position_errors, torque_error
+from calib.toolkit.opened_results import drawn, skeleton
 
 AZIMUTH, ELEVATION = np.deg2rad([-60.0, 20.0])  # from where the cell is seen
 HEIGHT = 2.5  # [in]
@@ -36,8 +36,8 @@ def _seen_from(points: np.ndarray) -> np.ndarray:
 
 def _cell(session: Session) -> Panel:
     """Return the arm at one of its poses, and the errors at all poses before and after, enlarged."""
-    (measured,), chain = scene.read(session.folder).measured, chain_of(session)
-    scale, arm = measured.arrow_scale(chain), _seen_from(scene.skeleton(chain, measured.q))
+    (measured,), chain = drawn(session.folder).measured, chain_of(session)
+    scale, arm = measured.arrow_scale(chain), _seen_from(skeleton(chain, measured.q))
     x, y = arm[int(np.argmax(arm[:, -1, 1] + np.abs(arm[:, -1, 0])))].T
     layers = [line(x, y, colour=QUIET, width=5.0), line(x, y, "o", colour=INK, size=4.0)]
     for points, colour in ((measured.nominal, BEFORE), (measured.calibrated, AFTER)):

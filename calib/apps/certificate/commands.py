@@ -5,7 +5,6 @@ from pathlib import Path
 import typer
 
 from calib.cli.shared import command, say
-from calib.errors import UsageError, command_line, require
 from calib.procedure.answers import CertificateSection
 
 app = typer.Typer()
@@ -24,18 +23,6 @@ def certificate(folder: Path, details: CertificateSection, svg: Path | None = No
         folder: of a fit, an identification, or a finished session
         svg: folder for all figures of the report as SVG
     """
-    from calib.folders import PAGES, SESSION
-    from calib.procedure.report.certificate import rendering, results
-    from calib.procedure.session import certificate as session
-    from calib.procedure.session.folder import open_session
+    from calib.toolkit.opened_results import open_result
 
-    if (folder / SESSION).exists():
-        redo = command_line("redo", folder, "certificate")
-        words = f"{folder / SESSION} has the details, under [certificate]; then: {redo}"
-        require(details == CertificateSection() and svg is not None, words, UsageError)
-        whole = session.pages(open_session(folder))[1]
-    else:
-        one, whole = results.read(folder, plots, details)
-        say(*rendering.write(folder, one, whole), f"written: {', '.join(str(folder / name) for name in PAGES)}")
-    if svg is not None:
-        say(f"{rendering.write_figures(svg, whole)} figures written to {svg}")
+    say(*open_result(folder, "certificate").certify(details, plots, svg))

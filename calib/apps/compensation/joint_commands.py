@@ -32,13 +32,12 @@ from calib.geometry.error_model import Discrepancy, ErrorModel, outside
 from calib.geometry.installation import Installation, see
 from calib.geometry.inverse import Goal
 from calib.geometry.observation import layout, pose_sigmas
-from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.findings import lines_of, sentence
-from calib.procedure.kinematic_stage.folder import IN_SESSION, VALIDATED, FitFolder, ValidationFolder
+from calib.procedure.kinematic_stage.folder import VALIDATED, ValidationFolder
 from calib.procedure.kinematic_stage.tables import read_covariance
-from calib.result_kinds import refusal
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
+from calib.toolkit.opened_results import open_result
 from calib.transforms import from_xyz_rpy, invert, pose, rotation_vector
 
 TOLERANCE = (1e-6, 1e-5)  # position [m] and orientation [rad] that a command may leave; our choice, as what follows
@@ -124,12 +123,11 @@ def read(folder: str | Path) -> Fitted:
     Raises:
         UsageError: where it is none, or lacks something.
     """
-    session, fit = Path(folder), FitFolder(Path(folder))
-    in_session, proof = FitFolder(session / IN_SESSION), ValidationFolder(session / VALIDATED)
-    fit = in_session if in_session.robot.is_file() and not fit.robot.is_file() else fit
-    identified = IdentificationFolder(fit.path).model.is_file()
-    if identified or not fit.robot.is_file():
-        raise UsageError(refusal(session, "compensate"))
+    result = open_result(folder, "compensate")
+    fit = result.fit("compensate")
+    if fit is None:
+        result.refuse("compensate")
+    proof = ValidationFolder(Path(folder) / VALIDATED)
     cell, nominal = installation.read_arms(fit.path)
     free, covariance = read_covariance(fit.path, cell)
     metrics = fit.metrics()

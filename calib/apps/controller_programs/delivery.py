@@ -18,10 +18,10 @@ from calib.apps.controller_programs.frames import ControllerFrame, Description, 
 from calib.apps.controller_programs.targets import number, pose_values
 from calib.controllers.table import Controller
 from calib.geometry.installation import Installation, read_arms
-from calib.procedure.export.delivery import verdicts
+from calib.procedure.export.delivery import fit_verdicts
 from calib.procedure.export.geometry import read
-from calib.procedure.kinematic_stage.folder import IN_SESSION, FitFolder
 from calib.robot.calibrated import CalibratedChain, nominal_of
+from calib.toolkit.opened_results import open_result
 from calib.transforms import invert
 
 DECIMALS = {"m": 7, "mm": 4}  # of frames, by the unit of lengths
@@ -41,11 +41,12 @@ def delivery_text(
     Raises:
         UsageError: for a folder without a fit.
     """
-    fit = folder / IN_SESSION if FitFolder(folder / IN_SESSION).robot.is_file() else folder
+    fit_folder = open_result(folder, "deliver").fit("deliver")
+    fit = folder if fit_folder is None else fit_folder.path
     robot, (cell, nominal) = read(fit, "deliver"), read_arms(fit)
     arm = Description.of_fit(fit, nominal.chain)
     frames = base_frame(controller, arm, world), flange_frame(controller, arm, flange)
-    lines = [f"{controller.title}: calibration of {robot.chain.name}", str(verdicts(fit)), ""]
+    lines = [f"{controller.title}: calibration of {robot.chain.name}", str(fit_verdicts(fit)), ""]
     lines += [f"It takes: {controller.takes}.", f"It does not: {controller.closed}.", ""]
     if len(nominal.tools):
         lines += [
@@ -55,7 +56,7 @@ def delivery_text(
         ]
     if not controller.mastered:
         lines.append("Its axes are not mastered by their users.")
-    elif FitFolder(fit).metrics().model == "offsets":
+    elif fit_folder is not None and fit_folder.metrics().model == "offsets":
         lines += [
             "Mastering, with frames that belong to it:",
             *_mastering(robot, controller),

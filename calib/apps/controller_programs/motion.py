@@ -14,24 +14,20 @@ from calib.apps.controller_programs.targets import number
 from calib.controllers.table import Controller
 from calib.data.csv_table import read_header, read_table
 from calib.errors import UsageError, require
-from calib.procedure.excitation.coefficients import PLANNED, RUN, SAMPLES
-from calib.result_kinds import refusal
+from calib.toolkit.opened_results import open_result
 
 PREFIX = "q_"
 
 
 def motion_file(path: Path) -> Path:
-    """Return the file to play of a motion's folder: the whole run if there is one; of a file, that file.
+    """Return the file to play of a motion's folder; of a file, that file.
 
     Raises:
         UsageError: for a folder without a motion.
     """
-    if not path.is_dir():
+    if path.is_file() and path.suffix != ".npz":
         return path
-    names = (RUN, PLANNED, SAMPLES)
-    paths = [path / name for name in names if (path / name).is_file()]
-    require(paths, refusal(path, "program"), UsageError)
-    return paths[0]
+    return open_result(path, "program").motion()
 
 
 def is_motion(path: Path) -> bool:

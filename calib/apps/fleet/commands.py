@@ -26,7 +26,7 @@ def run(sessions: list[str], workers: str = "1", plots: bool = True) -> None:
     from calib.apps.fleet import fleet as runs
     from calib.apps.fleet import stores
     from calib.apps.fleet.throughput import Throughput
-    from calib.procedure.session.results import folders_of
+    from calib.toolkit.sessions import folders_of
     from calib.workers import workers as opened
 
     folders, started, outcomes, pace = folders_of(sessions, stores.sessions), time.perf_counter(), [], Throughput()

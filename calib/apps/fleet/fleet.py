@@ -18,11 +18,8 @@ from calib.apps.fleet.stores import LEASE
 from calib.apps.fleet.throughput import Throughput
 from calib.arguments import checked
 from calib.errors import Busy, CalibError, TaskLost, complaint
-from calib.procedure.findings import LEVELS
-from calib.procedure.session.commands import COLOURS, go_on
-from calib.procedure.session.folder import SETTINGS, Say
-from calib.procedure.session.results import folders_of, position_errors, torque_error
-from calib.procedure.session.steps import DONE
+from calib.toolkit.result_folders import LEVELS
+from calib.toolkit.sessions import COLOURS, DONE, SETTINGS, Say, folders_of, go_on, position_errors, torque_error
 from calib.workers import Workers
 from calib.workers import workers as opened
 

@@ -20,10 +20,8 @@ import numpy as np
 
 from calib import files
 from calib.errors import UsageError, require
-from calib.geometry.installation import Installation
-from calib.geometry.observation import families
-from calib.robot import calibrated
-from calib.robot.calibrated import CalibratedChain, nominal_of
+from calib.toolkit.chains import CalibratedChain, nominal_of, write_calibrated
+from calib.toolkit.installations import Installation, families
 
 FAMILY = 4.0  # arms that the variance of a family of parameters counts as (our choice)
 MIN_WIDTH = 1e-6  # [m, rad] of the prior (our choice)
@@ -129,7 +127,7 @@ def expected_arm(robots: Sequence[CalibratedChain], parameters: Sequence[Paramet
 def write(folder: Path, robots: Sequence[CalibratedChain], parameters: Sequence[ParameterSpread]) -> Path:
     """Write the prior for `calib fit`: ``robot.toml``, the expected arm, and the options with its widths."""
     folder.mkdir(parents=True, exist_ok=True)
-    calibrated.write(folder, expected_arm(robots, parameters), comment=f"mean of {len(robots)} arms")
+    write_calibrated(folder, expected_arm(robots, parameters), comment=f"mean of {len(robots)} arms")
     lines = [f'"{parameter.name}" = {parameter.width:.4g}' for parameter in parameters]
     files.write(folder / OPTIONS, "\n".join(["[prior]", *lines, ""]))
     return folder

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from calib import files, folders
-from calib.api.rendering import Judged
 from calib.apps.fleet import prior
 from calib.apps.fleet.prior import ParameterSpread
 from calib.apps.fleet.tools import MIN_ARMS, MIN_TIMES, ToolUse, tools
@@ -23,14 +22,18 @@ from calib.apps.monitoring.comparison.places import check_same_robot
 from calib.apps.monitoring.comparison.robot_change import RobotChange, diff
 from calib.arguments import checked
 from calib.errors import Finding, RobotError, counted, finding
-from calib.geometry.fit import PLAUSIBLE
-from calib.procedure.findings import Verdict, lines_of, settle
-from calib.procedure.report.page import Block, RecordColumn, Section, Text, table
 from calib.records import plain
+from calib.result_kinds import BY_NAME
+from calib.toolkit.installations import PLAUSIBLE
+from calib.toolkit.report_pages import Block, RecordColumn, Section, Text, table
+from calib.toolkit.result_folders import Judged, Verdict, lines_of, settle
 from calib.units import small
 
 PAGE, PRIOR = "report.html", "prior"
-OURS = (PAGE, folders.METRICS)
+# A row per arm.
+ARMS = "fleet.csv"
+ARMS_HEADER = ("type", "arm", "verdict", "in the distribution")
+OURS = (PAGE, folders.METRICS, ARMS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +74,8 @@ class FleetReport(Judged):
             all arms of a type failed.
     """
 
+    kind = BY_NAME["fleet"]
+
     types: tuple[ArmType, ...]
     changes: tuple[tuple[str, RobotChange], ...]
     noticed: tuple[Finding, ...]
@@ -96,8 +101,11 @@ class FleetReport(Judged):
         return Section("Fleet", blocks, self.verdict.level, self.verdict.reason)
 
     @checked
-    def save(self, out: str | Path) -> Path:
-        """Write a folder: report.html, metrics.json, and for each type a prior for the fit of its next arm."""
+    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+        """Write a folder: report.html, fleet.csv (a row per arm), metrics.json; and for each type a prior.
+
+        That is for the fit of the type's next arm.
+        """
         out = Path(out)
         folders.check_target(out, OURS, (folders.METRICS,), "fleet report")
         folders.write_staged(out, OURS, self._write)
@@ -107,11 +115,15 @@ class FleetReport(Judged):
         return out
 
     def _write(self, folder: Path) -> None:
-        from calib.procedure.report.certificate.record import report
-        from calib.procedure.report.certificate.rendering import html
+        from calib.toolkit.report_pages import as_html, report_page
 
         count = sum(len(arm_type.arms) for arm_type in self.types)
-        files.write(folder / PAGE, html(report("Fleet", f"{count} arms", (), [self.section()])))
+        files.write(folder / PAGE, as_html(report_page("Fleet", f"{count} arms", (), [self.section()])))
+        arms = []
+        for arm_type in self.types:
+            usable = [arm.name for arm in arm_type.plausible]
+            arms += [(arm_type.name, arm.name, arm.judged[0], arm.name in usable) for arm in arm_type.arms]
+        files.write_table(folder / ARMS, ARMS_HEADER, arms)
         files.write_json(folder / folders.METRICS, self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:

@@ -8,7 +8,8 @@ from pathlib import Path
 from calib.apps.monitoring.comparison.calibrations import Calibration, read_fit
 from calib.apps.monitoring.comparison.places import Place, place_of
 from calib.errors import Finding, UsageError, finding, listing, require
-from calib.procedure.session.results import folders_of
+from calib.result_kinds import refusal
+from calib.toolkit.sessions import folders_of
 
 Visit = tuple[Place, Calibration]
 
@@ -39,6 +40,7 @@ def visits(calibrations: str | Path | Sequence[str | Path]) -> Visits:
     unfinished: list[str] = []
     visits_by_arm: dict[str, list[Visit]] = {}
     for source in places:
+        require(not source.nominal, refusal(source.name, "fleet"), UsageError)
         session = source.session
         waits = session and session.geometric and not source.fit
         require(source.fit or waits, f"a fleet's report takes fitted geometries, but {source.words}", UsageError)

@@ -16,12 +16,18 @@ import numpy as np
 
 from calib.apps.joining.stream_files import Stream
 
-BACKLASH = 1e-4  # by which a joint comes to rest before where it was sent, from either side [rad or m]
-KNOTS = 6  # of the polygon, ends included
-TRIED, CLOSER = 120, 40  # times at which a step is tried, evenly, then between the neighbours of the best
-MIN_STEP = 3e-3  # size of a step that is said [s]
-CERTAIN = 5.0, 7.0  # its size in σ, alone and beside the polygon
-STAMPED = 0.5  # share of the size by which the stamps may differ from it
+# by which a joint comes to rest before where it was sent, from either side [rad or m]
+BACKLASH = 1e-4
+# of the polygon, ends included
+KNOTS = 6
+# number of times at which a step is tried, evenly, then between the neighbours of the best
+COARSE_TIMES, FINE_TIMES = 120, 40
+# smallest step that is reported [s]
+MIN_STEP = 3e-3
+# its least size in σ, alone and beside the polygon
+CERTAIN_ALONE, CERTAIN_BESIDE_POLYGON = 5.0, 7.0
+# share of the size by which the stamps may differ from it
+STAMPED = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,16 +35,16 @@ class Equations:
     """Whitened least squares about a fit of clock and arm.
 
     Attributes:
-        matrix, wanted: (rows + priors, p) in any units, and (rows + priors,) what they are to explain.
-        late: (rows,) change per second of the clock's offset.
-        play: (rows, joints) change per rad or m of backlash.
+        matrix, target: (rows + priors, p) in any units, and (rows + priors,) what they are to explain.
+        offset_slope: (rows,) change per second of the clock's offset.
+        backlash_slopes: (rows, joints) change per rad or m of backlash.
         t: (rows,) the instrument's times [s].
     """
 
     matrix: np.ndarray
-    wanted: np.ndarray
-    late: np.ndarray
-    play: np.ndarray
+    target: np.ndarray
+    offset_slope: np.ndarray
+    backlash_slopes: np.ndarray
     t: np.ndarray
 
 
@@ -56,19 +62,29 @@ class Step:
         Args:
             log_time: of the step by the controller's clock, about [s].
         """
-        candidates = list[tuple[float, str]]()
-        for file, size, about in ((stream, self.size, self.time), (log, -self.size, log_time)):
-            reach = abs(self.size) + (file.t[-1] - file.t[0]) / TRIED
-            count, intervals = np.diff(file.rows), np.diff(file.t)
-            off = np.abs(intervals - count * np.median(intervals / count) - size) / abs(size)
-            off[np.abs(file.t[1:] - about) > reach] = np.inf
-            k = int(np.argmin(off))
-            row = file.rows[k + 1] if size > 0.0 else file.rows[k] + 1  # rows that go back were left out
-            candidates.append((float(off[k]), f"{Path(file.file).name}: row {row}, t = {file.t[k + 1]:.3f} s"))
-        smallest, location = min(candidates)
-        if smallest < STAMPED:
-            return location
-        return f"{Path(stream.file).name}: t = {self.time:.2f} s, {Path(log.file).name}: t = {log_time:.2f} s, about"
+        stream_misfit, stream_row = self._stamp(stream, self.size, self.time)
+        log_misfit, log_row = self._stamp(log, -self.size, log_time)
+        if min(stream_misfit, log_misfit) >= STAMPED:
+            times = f"{Path(stream.file).name}: t = {self.time:.2f} s, {Path(log.file).name}: t = {log_time:.2f} s"
+            return f"{times}, about"
+        if log_misfit < stream_misfit:
+            return log_row
+        return stream_row
+
+    def _stamp(self, file: Stream, size: float, time: float) -> tuple[float, str]:
+        """Return how far the stamps of a file differ from a step of `size` near `time` [s], as a share, and the row."""
+        intervals = np.diff(file.t)
+        row_counts = np.diff(file.rows)
+        even_step = np.median(intervals / row_counts)
+        misfit = np.abs(intervals - row_counts * even_step - size) / abs(size)
+        reach = abs(self.size) + (file.t[-1] - file.t[0]) / COARSE_TIMES
+        misfit[np.abs(file.t[1:] - time) > reach] = np.inf
+        k = int(np.argmin(misfit))
+        row = file.rows[k + 1]
+        if size <= 0.0:
+            # rows that go back were left out
+            row = file.rows[k] + 1
+        return float(misfit[k]), f"{Path(file.file).name}: row {row}, t = {file.t[k + 1]:.3f} s"
 
 
 def find_step(equations: Equations) -> tuple[Step | None, float]:
@@ -77,21 +93,39 @@ def find_step(equations: Equations) -> tuple[Step | None, float]:
     The second is 0 where a line is as good as a polygon.
     """
     begin, end = float(equations.t.min()), float(equations.t.max())
+    # the polygon: offsets at the inner knots, each with a hat function of the time
     knots = np.linspace(begin, end, KNOTS)
-    hats = np.array([np.interp(equations.t, knots, row) for row in np.eye(KNOTS)[1:-1]])
+    inner_knots = np.eye(KNOTS)[1:-1]
+    hats = np.array([np.interp(equations.t, knots, height) for height in inner_knots])
     errors, *columns = _projected(equations, list(hats))
     bends, _, _, _ = np.linalg.lstsq(np.array(columns).T, errors)
     remainder = float(np.sum((errors - bends @ columns) ** 2))
-    smooth, corners = float(errors @ errors) - remainder, np.array([0.0, *bends, 0.0])
-    away = float(np.abs(corners - np.polyval(np.polyfit(knots - begin, corners, 1), knots - begin)).max())
-    certain = smooth > CERTAIN[1] ** 2 * remainder / (len(equations.late) - equations.matrix.shape[1])
-    for beside, sigmas in zip((hats[:0], hats), CERTAIN):
-        times, spacing = np.linspace(begin, end, TRIED + 2, retstep=True)
-        best = _best(equations, times[1:-1], beside)[0]
-        step, explained = _best(equations, np.linspace(best.time - spacing, best.time + spacing, CLOSER), beside)
-        if abs(step.size) > max(MIN_STEP, sigmas * step.sigma) and (len(beside) or explained > smooth):
-            return step, away
-    return None, away if certain else 0.0
+    smooth = float(errors @ errors) - remainder
+
+    # its distance from a line
+    corners = np.array([0.0, *bends, 0.0])
+    line = np.polyfit(knots - begin, corners, 1)
+    away = float(np.abs(corners - np.polyval(line, knots - begin)).max())
+
+    step, explained = _search(equations, hats[:0])
+    if abs(step.size) > max(MIN_STEP, CERTAIN_ALONE * step.sigma) and explained > smooth:
+        return step, away
+    step, _ = _search(equations, hats)
+    if abs(step.size) > max(MIN_STEP, CERTAIN_BESIDE_POLYGON * step.sigma):
+        return step, away
+    degrees_of_freedom = len(equations.offset_slope) - equations.matrix.shape[1]
+    if smooth > CERTAIN_BESIDE_POLYGON**2 * remainder / degrees_of_freedom:
+        return None, away
+    return None, 0.0
+
+
+def _search(equations: Equations, beside: np.ndarray) -> tuple[Step, float]:
+    """Return the most certain step at any time, coarsely, then closely, and the sum of squares that it explains."""
+    begin, end = float(equations.t.min()), float(equations.t.max())
+    times, spacing = np.linspace(begin, end, COARSE_TIMES + 2, retstep=True)
+    coarse, _ = _best(equations, times[1:-1], beside)
+    fine_times = np.linspace(coarse.time - spacing, coarse.time + spacing, FINE_TIMES)
+    return _best(equations, fine_times, beside)
 
 
 def _best(equations: Equations, times: np.ndarray, beside: np.ndarray) -> tuple[Step, float]:
@@ -100,29 +134,39 @@ def _best(equations: Equations, times: np.ndarray, beside: np.ndarray) -> tuple[
     Args:
         beside: (n, rows) other changes of the offset [s] that are free.
     """
-    errors, *columns = _projected(equations, [*beside, *(equations.t > times[:, None])])
-    other_columns, columns = np.array(columns[: len(beside)]), np.array(columns[len(beside) :])
+    steps = equations.t > times[:, None]
+    errors, *columns = _projected(equations, [*beside, *steps])
+    step_columns = np.array(columns[len(beside) :])
     if len(beside):
-        base = np.linalg.qr(other_columns.T)[0]
-        errors, columns = errors - base @ (base.T @ errors), columns - (columns @ base) @ base.T
-    power = np.maximum(np.sum(columns**2, axis=1), 1e-300)
-    size = columns @ errors / power
+        beside_columns = np.array(columns[: len(beside)])
+        base, _ = np.linalg.qr(beside_columns.T)
+        errors = errors - base @ (base.T @ errors)
+        step_columns = step_columns - (step_columns @ base) @ base.T
+    power = np.maximum(np.sum(step_columns**2, axis=1), 1e-300)
+    size = step_columns @ errors / power
     explained = size**2 * power
     k = int(np.argmax(explained))
-    free = len(equations.late) - equations.matrix.shape[1] - equations.play.shape[1] - len(beside) - 1
-    variance = float(errors @ errors - explained[k]) / max(free, 1)
-    return Step(float(times[k]), float(size[k]), float(np.sqrt(variance / power[k]))), float(explained[k])
+    parameters = equations.matrix.shape[1] + equations.backlash_slopes.shape[1] + len(beside) + 1
+    degrees_of_freedom = len(equations.offset_slope) - parameters
+    variance = float(errors @ errors - explained[k]) / max(degrees_of_freedom, 1)
+    sigma = float(np.sqrt(variance / power[k]))
+    return Step(float(times[k]), float(size[k]), sigma), float(explained[k])
 
 
 def _projected(equations: Equations, changes: list[np.ndarray]) -> np.ndarray:
     """Return what all that is free cannot explain of the data (first row), and of changes (rows,) of the offset."""
-    rows, joints = equations.play.shape
+    rows, joints = equations.backlash_slopes.shape
+    count = len(equations.target)
+    # the fit's own equations, and backlash of each joint with its prior
+    fit_columns = np.pad(equations.matrix, ((0, joints), (0, 0)))
+    no_slope = np.zeros((count - rows, joints))
     prior = np.eye(joints) / BACKLASH
-    play = np.concatenate([equations.play, np.zeros((len(equations.wanted) - rows, joints)), prior])
-    matrix = np.column_stack([np.pad(equations.matrix, ((0, joints), (0, 0))), play])
+    backlash_columns = np.concatenate([equations.backlash_slopes, no_slope, prior])
+    matrix = np.column_stack([fit_columns, backlash_columns])
     matrix /= np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
-    sought = np.zeros((1 + len(changes), len(matrix)))
-    sought[0, : len(equations.wanted)] = equations.wanted
-    sought[1:, :rows] = np.array(changes) * equations.late
+
+    series = np.zeros((1 + len(changes), len(matrix)))
+    series[0, :count] = equations.target
+    series[1:, :rows] = np.array(changes) * equations.offset_slope
     inverse = np.linalg.pinv(matrix.T @ matrix, 1e-13, hermitian=True)
-    return sought - sought @ matrix @ inverse @ matrix.T
+    return series - series @ matrix @ inverse @ matrix.T

@@ -32,25 +32,39 @@ from calib.geometry.model_choice.ladder import EFFECTS
 from calib.geometry.observability import base_columns
 from calib.geometry.observation import layout, observe, parameter_values, prepare, step
 from calib.records import evenly
-from calib.robot.calibrated import Deflection
+from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.transforms import invert, rotation_vector
 
-GRID = 0.05  # of the offsets that are tried first [s]
-LEVERS = (0.0, 0.15, 0.4)  # by which the tip's turning counts as speed: the target's own is not known [m]
-PEAKS, APART = 3, 1.0  # offsets that are tried for each lever, and their least distance [s]
-OVERLAP = 0.5  # share of the shorter file that the longer one has, at least
-TRIMMED = 90  # percent of the residuals that an offset is judged by
-PLACED = 300  # rows that placements are guessed from
-MAX_RATIO = 0.15  # of the points' spread that a log of the same motion leaves with the nominal arm
-RIVAL = 1.3  # times the residual of the best offset, up to which another one is as good
-MAX_DRIFT = 1e-3  # prior standard deviation of a clock's drift
-BESIDE = 1e-3  # difference of times by which speeds are computed [s]
-ORDERS = 6  # of the harmonics that are fitted
-ROUNDS = 12  # of Gauss-Newton
-SETTLED = 1e-6  # change of the offset after which it ends [s]
-TERM_SIZES = (1e-3, 5.0)  # times their guessed size that terms are, at least and at most
+# of the offsets that are tried first [s]
+GRID = 0.05
+# by which the tip's turning counts as speed, since the target's position at the tip is not known [m]
+LEVERS = (0.0, 0.15, 0.4)
+# number of offsets that are tried for each lever, and their least distance [s]
+PEAKS, PEAK_DISTANCE = 3, 1.0
+# share of the shorter file that the longer one has, at least
+OVERLAP = 0.5
+# percent of the residuals that an offset is assessed by
+TRIMMED = 90
+# rows that placements are guessed from
+PLACED = 300
+# of the points' spread that a log of the same motion leaves with the nominal arm
+MAX_RATIO = 0.15
+# times the residual of the best offset, up to which another one is as good
+RIVAL = 1.3
+# prior standard deviation of a clock's drift
+MAX_DRIFT = 1e-3
+# difference of times by which speeds are computed [s]
+TIME_STEP = 1e-3
+# of the harmonics that are fitted
+ORDERS = 6
+# of Gauss-Newton
+ROUNDS = 12
+# change of the offset after which it ends [s]
+SETTLED = 1e-6
+# times their guessed size that terms are, at least and at most
+TERM_SIZES = (1e-3, 5.0)
 _NONE = np.array([], dtype=int)
 
 
@@ -94,15 +108,21 @@ class Run:
 
     def joints(self, clock: Clock, rows: np.ndarray, order: int = 0) -> np.ndarray:
         """Return the log's joints (m, n) at the times of rows, or a derivative; outside the log those of its ends."""
-        return self._path(np.clip(clock.controller(self.stream.t[rows]), *self.log.t[[0, -1]]), order)
+        times = clock.controller(self.stream.t[rows])
+        start, end = self.log.t[[0, -1]]
+        return self._path(np.clip(times, start, end), order)
 
     def known(self, clock: Clock, count: int | None = None) -> np.ndarray:
-        """Return the rows, or as many of them evenly, whose times are between two of the log that are no gap apart."""
-        t, log = clock.controller(self.stream.t), self.log
+        """Return the rows whose times are between two of the log that are no gap apart; evenly `count` of them."""
+        log = self.log
+        t = clock.controller(self.stream.t)
         after = np.clip(np.searchsorted(log.t, t), 1, len(log.t) - 1)
         bridged = log.t[after] - log.t[after - 1] <= log.gap
-        rows = np.flatnonzero(bridged & (t >= log.t[0]) & (t <= log.t[-1]))
-        return rows[evenly(len(rows), count)] if count else rows
+        in_log = (t >= log.t[0]) & (t <= log.t[-1])
+        rows = np.flatnonzero(bridged & in_log)
+        if count is None:
+            return rows
+        return rows[evenly(len(rows), count)]
 
     def lines(self) -> list[str]:
         """Return what is to be said of both files."""
@@ -113,21 +133,36 @@ class Run:
         return replace(take(self.points, rows), q=self.joints(clock, rows))
 
 
+@dataclass(frozen=True, eq=False)
+class _Start:
+    """Nominal arm placed at one offset of the clocks; `misfit` is the rms of the smallest residuals [m]."""
+
+    misfit: float
+    clock: Clock
+    cell: Installation
+
+
 def begin(chain: Chain, run: Run) -> tuple[Installation, Clock, tuple[float, ...]]:
     """Return the nominal arm placed, the clock to begin with, and other offsets that are as good [s].
 
     Raises:
         MeasurementError: where no offset brings the points onto the nominal arm's path.
     """
-    starts, middle = list[tuple[float, Clock, Installation]](), float(run.stream.t[[0, -1]].mean())
+    middle = float(run.stream.t[[0, -1]].mean())
+    starts = list[_Start]()
     for offset in _offsets(chain, run):
         clock = Clock(offset, middle=middle)
-        if len(rows := run.known(clock, PLACED)) < PLACED / 3:
+        rows = run.known(clock, PLACED)
+        if len(rows) < PLACED / 3:
             continue
-        cell, clock, _ = fitted(install(chain, [run.at(clock, rows)]), run, rows, clock, arm=False)
-        sizes = np.sort(np.linalg.norm(residuals(cell, run, rows, clock)[:3], axis=0))
-        starts.append((float(np.sqrt(np.mean(sizes[: TRIMMED * len(rows) // 100] ** 2))), clock, cell))
-    best_misfit = min((start[0] for start in starts), default=np.inf)
+        guess = install(chain, [run.at(clock, rows)])
+        cell, clock, _ = fitted(guess, run, rows, clock, arm=False)
+        position_residuals = residuals(cell, run, rows, clock)[:3]
+        distances = np.sort(np.linalg.norm(position_residuals, axis=0))
+        smallest = distances[: TRIMMED * len(rows) // 100]
+        starts.append(_Start(float(np.sqrt(np.mean(smallest**2))), clock, cell))
+
+    best_misfit = min((start.misfit for start in starts), default=np.inf)
     spread = float(np.linalg.norm(run.points.position.std(axis=0)))
     if best_misfit > min(MAX_RATIO * spread, MAX_MISFIT * chain.stretched_length()):
         refuse_data(
@@ -137,38 +172,55 @@ def begin(chain: Chain, run: Run) -> tuple[Installation, Clock, tuple[float, ...
             "motion, and of this robot, did instrument and target stay in place, and did no clock jump? "
             f"({'; '.join(run.lines())})",
         )
-    alike = [start for start in starts if start[0] < RIVAL * best_misfit]
-    _, clock, cell = max(alike, key=lambda start: len(run.known(start[1])))
-    rivals = {round(rival.offset, 2) for _, rival, _ in alike if abs(rival.offset - clock.offset) > APART}
-    return cell, Clock(clock.offset, middle=middle), tuple(sorted(rivals))
+    alike = [start for start in starts if start.misfit < RIVAL * best_misfit]
+    best = max(alike, key=lambda start: len(run.known(start.clock)))
+    offset = best.clock.offset
+    rivals = set[float]()
+    for start in alike:
+        if abs(start.clock.offset - offset) > PEAK_DISTANCE:
+            rivals.add(round(start.clock.offset, 2))
+    return best.cell, Clock(offset, middle=middle), tuple(sorted(rivals))
 
 
 def _offsets(chain: Chain, run: Run) -> list[float]:
     """Return offsets of the clocks [s] at which the speeds of the arm and of the points go together."""
     arm = forward(chain, _even(run.log))
-    turns = np.linalg.norm(rotation_vector(invert(arm[:-1])[:, :3, :3] @ arm[1:, :3, :3]), axis=1)
-    arm_steps, point_steps = (
-        np.linalg.norm(np.diff(p, axis=0), axis=1) for p in (arm[:, :3, 3], _even(run.stream)[:, :3])
-    )
-    lags = GRID * correlation_lags(len(point_steps), len(arm_steps)) + run.stream.t[0] - run.log.t[0]
-    shared = np.round(correlate(np.ones(len(point_steps)), np.ones(len(arm_steps))))
-    possible, offsets = shared > OVERLAP * min(len(point_steps), len(arm_steps)), list[float]()
+    arm_steps = _step_lengths(arm[:, :3, 3])
+    rotations = invert(arm[:-1])[:, :3, :3] @ arm[1:, :3, :3]
+    turns = np.linalg.norm(rotation_vector(rotations), axis=1)
+    point_steps = _step_lengths(_even(run.stream)[:, :3])
+
+    arm_count, point_count = len(arm_steps), len(point_steps)
+    lags = GRID * correlation_lags(point_count, arm_count) + run.stream.t[0] - run.log.t[0]
+    shared = np.round(correlate(np.ones(point_count), np.ones(arm_count)))
+    possible = shared > OVERLAP * min(point_count, arm_count)
+    offsets = list[float]()
     for lever in LEVERS:
-        alike = _alike(_cut(point_steps), _cut(np.hypot(arm_steps, lever * turns))) * np.sqrt(shared / shared.max())
-        alike[~possible] = -np.inf
+        arm_speed = _cut(np.hypot(arm_steps, lever * turns))
+        # a correlation over a longer overlap counts more
+        score = _alike(_cut(point_steps), arm_speed) * np.sqrt(shared / shared.max())
+        score[~possible] = -np.inf
         for _ in range(PEAKS):
-            best = float(lags[int(np.argmax(alike))])
-            alike[np.abs(lags - best) < APART] = -np.inf
+            best = float(lags[int(np.argmax(score))])
+            score[np.abs(lags - best) < PEAK_DISTANCE] = -np.inf
             offsets.append(best)
-    return [
-        offset for k, offset in enumerate(offsets) if all(abs(offset - earlier) > APART / 2 for earlier in offsets[:k])
-    ]
+
+    distinct = list[float]()
+    for k, offset in enumerate(offsets):
+        if all(abs(offset - earlier) > PEAK_DISTANCE / 2 for earlier in offsets[:k]):
+            distinct.append(offset)
+    return distinct
+
+
+def _step_lengths(positions: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(np.diff(positions, axis=0), axis=1)
 
 
 def _even(stream: Stream) -> np.ndarray:
     """Return a stream's values (m, k) on the grid of the offsets."""
     t = np.arange(stream.t[0], stream.t[-1], GRID)
-    return np.column_stack([np.interp(t, stream.t, column) for column in stream.values.T])
+    columns = [np.interp(t, stream.t, column) for column in stream.values.T]
+    return np.column_stack(columns)
 
 
 def _cut(speed: np.ndarray) -> np.ndarray:
@@ -180,25 +232,32 @@ def _alike(series_a: np.ndarray, series_b: np.ndarray) -> np.ndarray:
     """Return the correlation coefficient of two series where they overlap, at every lag."""
     ones_a, ones_b = np.ones(len(series_a)), np.ones(len(series_b))
     count = np.maximum(np.round(correlate(ones_a, ones_b)), 1.0)
-    mean, mean_b = correlate(series_a, ones_b) / count, correlate(ones_a, series_b) / count
-    power = (correlate(series_a**2, ones_b) / count - mean**2) * (correlate(ones_a, series_b**2) / count - mean_b**2)
-    return (correlate(series_a, series_b) / count - mean * mean_b) / np.sqrt(np.maximum(power, 1e-6 * power.max()))
+    mean_a = correlate(series_a, ones_b) / count
+    mean_b = correlate(ones_a, series_b) / count
+    variance_a = correlate(series_a**2, ones_b) / count - mean_a**2
+    variance_b = correlate(ones_a, series_b**2) / count - mean_b**2
+    power = variance_a * variance_b
+    covariance = correlate(series_a, series_b) / count - mean_a * mean_b
+    return covariance / np.sqrt(np.maximum(power, 1e-6 * power.max()))
 
 
 def residuals(cell: Installation, run: Run, rows: np.ndarray, clock: Clock) -> np.ndarray:
     """Return the residuals (3 or 6, m) of rows: of positions [m], then of orientations [rad]."""
     (block,) = prepare(cell, [run.at(clock, rows)])
-    return np.concatenate([part.value for part in observe(cell, block, _NONE)])
+    parts = observe(cell, block, _NONE)
+    return np.concatenate([part.value for part in parts])
 
 
 def velocities(cell: Installation, run: Run, rows: np.ndarray, clock: Clock) -> np.ndarray:
     """Return the velocities (3 or 6, m) [m/s, then rad/s] of the target at rows, as the installation's arm moves it."""
-    later, sooner = (residuals(cell, run, rows, replace(clock, offset=clock.offset + s)) for s in (BESIDE, -BESIDE))
-    return (later - sooner) / (2.0 * BESIDE)
+    later = replace(clock, offset=clock.offset + TIME_STEP)
+    sooner = replace(clock, offset=clock.offset - TIME_STEP)
+    difference = residuals(cell, run, rows, later) - residuals(cell, run, rows, sooner)
+    return difference / (2.0 * TIME_STEP)
 
 
 def fitted(
-    cell: Installation, run: Run, rows: np.ndarray, clock: Clock, arm: bool = True, play: bool = False
+    cell: Installation, run: Run, rows: np.ndarray, clock: Clock, arm: bool = True, backlash: bool = False
 ) -> tuple[Installation, Clock, Equations]:
     """Return the installation and the clock that fit some rows best, and the last equations; σ is of independent rows.
 
@@ -206,56 +265,89 @@ def fitted(
         cell, clock: where to start: the nominal arm, about which its parameters have a wide prior.
         arm: whether the arm, with all effects that a model of `calib fit` may have, is fitted, too, not placements,
             offset and drift alone.
-        play: whether the backlash of its joints is, too, which else passes for a clock that is late; rows are then
+        backlash: whether the backlash of its joints is, too, which else passes for a clock that is late; rows are then
             taken to have no outliers.
     """
-    families = [[t for t in effect(cell.chain, False) if t.order <= ORDERS] for effect in EFFECTS.values() if arm]
-    terms = tuple(term for family in families for term in family)
-    cell = replace(cell, deflection=Deflection(terms, np.zeros(len(terms)), cell.chain)) if arm else cell
-    start, table, t = cell, layout(cell), run.stream.t[rows] - clock.middle
+    families = list[list[Term]]()
+    terms = list[Term]()
+    if arm:
+        for effect in EFFECTS.values():
+            family = [term for term in effect(cell.chain, False) if term.order <= ORDERS]
+            families.append(family)
+            terms += family
+        cell = replace(cell, deflection=Deflection(tuple(terms), np.zeros(len(terms)), cell.chain))
+    start = cell
+
+    # columns: rigid parameters, terms of the effects, backlash, offset and drift
+    table = layout(cell)
     free = table.rigid_index if arm else table.frame_index
-    free = free[base_columns(cell, prepare(cell, [run.at(clock, rows)]), free).kept]
-    moving, loss = cell.chain.moving, "none" if play else "huber"
-    played = len(moving) if play else 0
-    sizes = (plausible_deviation(cell, free), term_sizes(terms), np.full(played, BACKLASH), [np.inf, MAX_DRIFT])
-    guess = np.concatenate(sizes)
-    group = np.repeat([-1, *range(len(families) + 1), -1], [len(free), *map(len, families), played, 2])
-    free = np.concatenate([free, table.index("deflection")])
-    has_prior, spread = np.isfinite(guess), np.full(len(guess), np.inf)
+    determined = base_columns(cell, prepare(cell, [run.at(clock, rows)]), free).kept
+    rigid = free[determined]
+    free = np.concatenate([rigid, table.index("deflection")])
+    moving = cell.chain.moving
+    backlash_count = len(moving) if backlash else 0
+    rigid_guess = plausible_deviation(cell, rigid)
+    backlash_guess = np.full(backlash_count, BACKLASH)
+    guess = np.concatenate([rigid_guess, term_sizes(tuple(terms)), backlash_guess, [np.inf, MAX_DRIFT]])
+    family_sizes = [len(family) for family in families]
+    counts = [len(rigid), *family_sizes, backlash_count, 2]
+    group = np.repeat([-1, *range(len(families) + 1), -1], counts)
+    has_prior = np.isfinite(guess)
+
+    loss = "none" if backlash else "huber"
+    middle_time = run.stream.t[rows] - clock.middle
+    spread = np.full(len(guess), np.inf)
     for _ in range(ROUNDS):
-        (block,) = prepare(cell, [run.at(clock, rows)])
-        parts, turned = observe(cell, block, free), observe(cell, block, moving)
+        # the prior's mean minus the present values
         pulled = np.zeros(len(guess))
-        pulled[: len(free)], pulled[-1] = (parameter_values(start) - parameter_values(cell))[free], -clock.drift
+        pulled[: len(free)] = (parameter_values(start) - parameter_values(cell))[free]
+        pulled[-1] = -clock.drift
+
+        (block,) = prepare(cell, [run.at(clock, rows)])
+        parts = observe(cell, block, free)
+        joint_parts = observe(cell, block, moving)
+        speeds = np.split(velocities(cell, run, rows, clock), len(parts))
+        # the side from which each joint comes
         side = np.sign(run.joints(clock, rows, 1).T)[:, None]
-        weighted, slopes, plays, lates = list[np.ndarray](), list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
-        for part, joints, speed in zip(parts, turned, np.split(velocities(cell, run, rows, clock), len(parts))):
+        targets, slopes = list[np.ndarray](), list[np.ndarray]()
+        backlash_slopes, offset_slopes = list[np.ndarray](), list[np.ndarray]()
+        for part, joint_part, speed in zip(parts, joint_parts, speeds):
             sigma = max(robust.spread(part.value), 1e-9)
-            weight = np.sqrt(robust.weights(np.sqrt(np.mean(part.value**2, axis=0)) / sigma, loss)) / sigma
-            weighted.append((weight * part.value).ravel())
-            plays.append((weight * side * joints.jacobian).reshape(len(moving), -1).T)
-            lates.append((weight * -speed).ravel())
-            columns = np.concatenate([part.jacobian, [-speed, -t * speed]])
+            size = np.sqrt(np.mean(part.value**2, axis=0))
+            weight = np.sqrt(robust.weights(size / sigma, loss)) / sigma
+            targets.append((weight * part.value).ravel())
+            offset_slopes.append((weight * -speed).ravel())
+            backlash_slope = weight * side * joint_part.jacobian
+            backlash_slopes.append(backlash_slope.reshape(len(moving), -1).T)
+            columns = np.concatenate([part.jacobian, [-speed, -middle_time * speed]])
             columns = (weight * columns).reshape(len(columns), -1).T
-            slopes.append(np.hstack([columns[:, :-2], plays[-1][:, :played], columns[:, -2:]]))
-        prior = _sized(np.concatenate(slopes), np.concatenate(weighted), pulled, guess, group) if arm else guess
-        matrix = np.concatenate([*slopes, np.diag(1.0 / prior)[has_prior]])
-        target = np.concatenate([*weighted, (pulled / prior)[has_prior]])
-        size = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
-        matrix /= size
+            before, clock_columns = columns[:, :-2], columns[:, -2:]
+            slopes.append(np.hstack([before, backlash_slopes[-1][:, :backlash_count], clock_columns]))
+
+        prior = guess
+        if arm:
+            prior = _sized(np.concatenate(slopes), np.concatenate(targets), pulled, guess, group)
+        prior_rows = np.diag(1.0 / prior)[has_prior]
+        matrix = np.concatenate([*slopes, prior_rows])
+        target = np.concatenate([*targets, (pulled / prior)[has_prior]])
+        scale = np.maximum(np.linalg.norm(matrix, axis=0), 1e-300)
+        matrix /= scale
         inverse = np.linalg.pinv(matrix.T @ matrix, 1e-13, hermitian=True)
         change = inverse @ (matrix.T @ target)
-        variance = float(np.sum((target - matrix @ change) ** 2)) / max(len(target) - len(guess), 1)
-        spread = np.sqrt(variance * np.diag(inverse)) / size
-        change /= size
+        squares = float(np.sum((target - matrix @ change) ** 2))
+        variance = squares / max(len(target) - len(guess), 1)
+        spread = np.sqrt(variance * np.diag(inverse)) / scale
+        change /= scale
         cell = step(cell, free, change[: len(free)])
         clock = replace(clock, offset=clock.offset + change[-2], drift=clock.drift + change[-1])
         if abs(change[-2]) < SETTLED:
             break
-    offset_slope = np.concatenate(lates)
+
+    clock = replace(clock, sigma=float(spread[-2]), drift_sigma=float(spread[-1]))
+    offset_slope = np.concatenate(offset_slopes)
     times = np.tile(run.stream.t[rows], len(offset_slope) // len(rows))
-    equations = Equations(matrix, target, offset_slope, np.concatenate(plays), times)
-    return cell, replace(clock, sigma=float(spread[-2]), drift_sigma=float(spread[-1])), equations
+    equations = Equations(matrix, target, offset_slope, np.concatenate(backlash_slopes), times)
+    return cell, clock, equations
 
 
 def _sized(
@@ -272,7 +364,10 @@ def _sized(
     ungrouped = group < 0
     prior_rows = ungrouped & np.isfinite(guess)
     rows = np.concatenate([matrix, np.diag(1.0 / guess)[prior_rows]])
-    data = np.concatenate([target - matrix @ np.where(ungrouped, 0.0, pulled), (pulled / guess)[prior_rows]])
-    unit = np.where(ungrouped, 1.0 / np.maximum(np.linalg.norm(rows, axis=0), 1e-300), guess)
+    unexplained = target - matrix @ np.where(ungrouped, 0.0, pulled)
+    data = np.concatenate([unexplained, (pulled / guess)[prior_rows]])
+    size = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+    unit = np.where(ungrouped, 1.0 / size, guess)
     evidence = relevance(gram(data, rows * unit), group, np.ones(len(unit)))
-    return np.where(ungrouped, guess, np.clip(evidence.ridge, *TERM_SIZES) * guess)
+    factor = np.clip(evidence.ridge, *TERM_SIZES)
+    return np.where(ungrouped, guess, factor * guess)

@@ -16,8 +16,14 @@ CLOCKS = ("t", "time", "timestamp", "datetime")
 
 def column_of(table: Table, names: Sequence[str]) -> str:
     """Return the table's first column that has one of the `names`, in any spelling; "" without any."""
-    plain = {re.sub(r"[^a-z0-9]", "", name.lower()): name for name in reversed(table.header)}
-    return next((plain[name] for name in names if name in plain), "")
+    # of two columns with the same plain name the first
+    plain = dict[str, str]()
+    for name in table.header:
+        plain.setdefault(re.sub(r"[^a-z0-9]", "", name.lower()), name)
+    for name in names:
+        if name in plain:
+            return plain[name]
+    return ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,5 +42,8 @@ class Joined:
 
     def write(self, path: Path) -> Path:
         """Write the table as CSV, the notes as comments above it."""
-        header = [f"{name} [{unit}]" if unit else name for name, unit in zip(self.table.header, self.table.units)]
-        return files.write_table(path, header, zip(*(cells.tolist() for cells in self.table.cells)), self.notes)
+        header = []
+        for name, unit in zip(self.table.header, self.table.units):
+            header.append(f"{name} [{unit}]" if unit else name)
+        columns = [cells.tolist() for cells in self.table.cells]
+        return files.write_table(path, header, zip(*columns), self.notes)

@@ -27,9 +27,8 @@ on its own (`--stations one`).
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from datetime import datetime
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +43,7 @@ from calib.arguments import checked
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.columns import POSITION, SIGMA, Sheet
 from calib.data.poses.measurements import PoseMeasurements
-from calib.errors import MeasurementError, UsageError, counted, finding, listing, one_of, refuse_data, require
+from calib.errors import MeasurementError, UsageError, counted, finding, listing, one_of, refuse_data
 from calib.geometry.first_guess import check_scale
 from calib.procedure.findings import lines_of
 from calib.robot.calibrated import CalibratedChain
@@ -52,12 +51,21 @@ from calib.robot.chain import Chain
 from calib.robot.library import load_calibrated
 from calib.units import TIMES
 
-WAYS = ("name", "time", "row", "geometry", "motion")
-MAX_APART = 1e-3  # of two readings of one pose [m], where nothing is known of their scatter (our choice)
-TIMES_USUAL = 10.0  # the median distance of two readings of one pose, up to which they are one (our choice)
-MIN_REPEATS = 5  # degrees of freedom of a scatter that is stated as sigma (our choice)
-STANDSTILL = 0.25  # before and after a point the arm stands [s], moving at most
-MAX_MOTION = 1e-3  # of a joint's whole travel (our choice)
+METHODS = ("name", "time", "row", "geometry", "motion")
+# what the files need for each of the methods without motion
+REQUIREMENTS = ("both files need a column of names (name, pose, id …)", "of times (t)", "as many rows", "give --robot")
+
+# Thresholds are our choice.
+# distance of two readings of one pose [m], where nothing is known of their scatter
+MAX_DISTANCE = 1e-3
+# times the median distance of two readings of one pose, up to which they are one
+MAX_DISTANCE_RATIO = 10.0
+# degrees of freedom of a scatter that is stated as sigma
+MIN_REPEATS = 5
+# before and after a point the arm stands [s], moving at most
+STANDSTILL = 0.25
+# of a joint's whole travel
+MAX_MOTION = 1e-3
 _MEASURED = re.compile(r"[xyz]\d*(_meas|_measured)?")
 
 
@@ -89,50 +97,55 @@ def join(
         UsageError: for another `by`, or one that the files have no columns for.
         MeasurementError: where the files do not go together.
     """
-    one_of(by or "row", WAYS, "by", UsageError)
-    arm = load_calibrated(robot, base, tip) if isinstance(robot, str | Path) else robot
+    one_of(by or "row", METHODS, "by", UsageError)
+    joints_file, points_file = Path(joints), Path(points)
+    if isinstance(robot, str | Path):
+        robot = load_calibrated(robot, base, tip)
     if by == "motion":
-        if arm is None:
+        if robot is None:
             raise UsageError("by motion the clocks are found from the nominal arm's path: give --robot")
-        return join_streams(Path(joints), Path(points), arm.complete)
-    joint_table = joints_table(Path(joints)) if is_program(Path(joints)) else read_table(joints)
-    return _joined(joint_table, read_table(points), by, arm and arm.complete)
+        return join_streams(joints_file, points_file, robot.complete)
+    if is_program(joints_file):
+        joint_table = joints_table(joints_file)
+    else:
+        joint_table = read_table(joints)
+    chain = None if robot is None else robot.complete
+    return _joined(joint_table, read_table(points), by, chain)
 
 
 def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joined:
-    name_columns, time_columns = (
-        [column_of(table, column_names) for table in (joints, points)] for column_names in (NAMES, CLOCKS)
-    )
+    name_columns = [column_of(joints, NAMES), column_of(points, NAMES)]
+    time_columns = [column_of(joints, CLOCKS), column_of(points, CLOCKS)]
     possible = {
         "name": all(name_columns),
         "time": all(time_columns),
         "row": len(joints) == len(points),
         "geometry": bool(chain),
     }
-    by = by or next((method for method, holds in possible.items() if holds), "")
-    requirements = (
-        "both files need a column of names (name, pose, id …)",
-        "of times (t)",
-        "as many rows",
-        "give --robot",
-    )
+    if not by:
+        by = next((method for method, is_possible in possible.items() if is_possible), "")
     counts = f"{len(joints)} rows of joints, {len(points)} points"
-    require(
-        by and possible[by], f"{counts} cannot be joined{by and f' by {by}'}: {', or '.join(requirements)}", UsageError
-    )
-    keys, notes = {*name_columns, *time_columns}, ()
+    if not by or not possible[by]:
+        method = f" by {by}" if by else ""
+        raise UsageError(f"{counts} cannot be joined{method}: {', or '.join(REQUIREMENTS)}")
+
+    notes = ()
     if by == "time":
         joints, pose, notes = _at_times(joints, points, *time_columns)
+    elif by == "name":
+        pose = _same_names(joints, points, *name_columns)
+        if not (pose >= 0).any():
+            raise MeasurementError(f"{points.file}: no name is one of {joints.file}")
     else:
-        pose = _same_names(joints, points, *name_columns) if by == "name" else np.arange(len(points))
-        require(by != "name" or (pose >= 0).any(), f"{points.file}: no name is one of {joints.file}", MeasurementError)
+        pose = np.arange(len(points))
     if chain is not None and by != "time":
-        q = Sheet(joints).joints(chain.joint_names)[0]
-        pose, notes = ordered(chain, q, points, {} if by == "geometry" else {f"joined by {by}": pose})
+        q, _ = Sheet(joints).joints(chain.joint_names)
+        candidates = {} if by == "geometry" else {f"joined by {by}": pose}
+        pose, notes = ordered(chain, q, points, candidates)
     else:
         notes = (f"{counts}, joined by {by}", *notes)
-    notes = (*joints.notes, *points.notes, *notes)
-    return merged(joints, points, pose, notes, [name for name in keys if name])
+    keys = {*name_columns, *time_columns} - {""}
+    return merged(joints, points, pose, (*joints.notes, *points.notes, *notes), keys)
 
 
 def ordered(
@@ -149,45 +162,51 @@ def ordered(
     """
     position = _positions(sheet or Sheet(points))
     measured = np.flatnonzero(np.isfinite(position).all(axis=1))
-    few = f"{len(measured)} points are too few to find their poses by the robot's geometry (at least {MIN_POINTS})"
     if len(measured) < MIN_POINTS:
-        origin, pose = next(
-            ((origin, pose) for origin, pose in candidates.items() if (pose >= 0).all()), ("", measured)
-        )
-        require(origin, f"{few}: name them (a column 'pose' with the pose's number)", MeasurementError, points.file)
-        return pose, (f"{len(pose)} points, {origin}; {few}",)
-    spread = PoseMeasurements.of(
+        few = f"{len(measured)} points are too few to find their poses by the robot's geometry (at least {MIN_POINTS})"
+        for origin, pose in candidates.items():
+            if (pose >= 0).all():
+                return pose, (f"{len(pose)} points, {origin}; {few}",)
+        refuse_data(points.file, f"{few}: name them (a column 'pose' with the pose's number)")
+
+    # says which unit explains points that spread too far
+    block = PoseMeasurements.of(
         q[measured % len(q)], position[measured], joint_names=chain.joint_names, file=points.file
     )
-    check_scale(spread, chain)  # says which unit explains points that spread too far
-    found = find_order(chain, q, position[measured], {origin: pose[measured] for origin, pose in candidates.items()})
-    if found is None:
-        order, advice = "any order", ""
+    check_scale(block, chain)
+    measured_candidates = {origin: pose[measured] for origin, pose in candidates.items()}
+    order = find_order(chain, q, position[measured], measured_candidates)
+    if order is None:
+        searched, advice = "any order", ""
         if len(measured) < MIN_FOUND:
-            order, advice = (
-                "their order",
-                f" With {MIN_FOUND} points or more any order is found; else name them (a column 'pose')",
-            )
+            searched = "their order"
+            advice = f" With {MIN_FOUND} points or more any order is found; else name them (a column 'pose')"
         limit = 1e3 * MAX_MISFIT * chain.stretched_length()
         refuse_data(
             points.file,
-            f"its {len(measured)} points are not those of these {len(q)} poses in {order} (within {limit:.0f} mm of "
+            f"its {len(measured)} points are not those of these {len(q)} poses in {searched} (within {limit:.0f} mm of "
             f"the nominal arm): is it this robot and this list, and did instrument and target stay in place?{advice}",
         )
     pose = np.full(len(position), -1)
-    pose[measured] = found.pose
-    notes = [f"{len(measured)} points, {found.how} ({1e3 * found.rms:.2g} mm rms from the nominal arm)"]
-    if len(strange := measured[found.pose < 0]):
+    pose[measured] = order.pose
+    notes = [f"{len(measured)} points, {order.origin} ({1e3 * order.rms:.2g} mm rms from the nominal arm)"]
+    strange = measured[order.pose < 0]
+    if len(strange):
         notes.append(f"belonging to no pose, left out: rows {listing(points.rows[strange])}")
-    if found.rivals:
-        doubtful = measured[list(found.rivals)]
+    if order.rivals:
+        doubtful = measured[list(order.rivals)]
         pose[doubtful] = -1
         notes.append(f"poses too close together to tell apart, left out: rows {listing(points.rows[doubtful])}")
     return pose, tuple(notes)
 
 
 def merged(
-    joints: Table, points: Table, pose: np.ndarray, notes: Sequence[str], keys: Sequence[str], name_missing: bool = True
+    joints: Table,
+    points: Table,
+    pose: np.ndarray,
+    notes: Sequence[str],
+    keys: Collection[str],
+    name_missing: bool = True,
 ) -> Joined:
     """Return the joints' rows with the points (m,) of each, several readings of one pose averaged.
 
@@ -196,42 +215,60 @@ def merged(
         keys: columns by which they were joined, left out.
         name_missing: whether a note names the poses without a point.
     """
-    position, label = _positions(Sheet(points)), _labels(joints)
+    position = _positions(Sheet(points))
+    label = _labels(joints)
+    # rows of the readings of each pose
     groups = {int(k): np.flatnonzero(pose == k) for k in np.unique(pose[pose >= 0])}
-    missing, stray = [label[k] for k in range(len(joints)) if k not in groups], points.rows[pose < 0]
+    missing = [label[k] for k in range(len(joints)) if k not in groups]
+    stray = points.rows[pose < 0]
     groups, inconsistent = _consistent(position, groups, label, points)
-    require(groups, f"{points.file}: none of its {len(points)} points is left", MeasurementError)
+    if not groups:
+        raise MeasurementError(f"{points.file}: none of its {len(points)} points is left")
     notes = [*notes, *inconsistent]
     if missing and name_missing:
         notes.append(f"without a point: {len(missing)} of {len(joints)} poses: {listing(missing)}")
     if len(stray):
         notes.append(f"points left out: rows {listing(stray)}")
-    pose_rows, count = np.array(list(groups), dtype=int), np.array([[len(rows)] for rows in groups.values()])
+
+    pose_rows = np.array(list(groups), dtype=int)
+    labels = np.array([label[k] for k in pose_rows], dtype=object)
+    header, units, cells = ["pose"], [""], [labels]
     point_names = [name for name in points.header if name not in keys]
-    joint_names = [name for name in joints.header if name not in keys and name not in point_names]
-    columns = {name: joints.cells[joints.index(name)][pose_rows] for name in joint_names}
-    columns |= {name: _averaged(points, name, groups, position) for name in point_names}
-    units = [
-        table.units[table.index(name)]
-        for table, names in ((joints, joint_names), (points, point_names))
-        for name in names
-    ]
-    if repeats := int(count.sum() - len(count)):
-        squares = sum(((position[rows] - position[rows].mean(axis=0)) ** 2).sum(axis=0) for rows in groups.values())
+    for name in joints.header:
+        if name not in keys and name not in point_names:
+            column = joints.index(name)
+            header.append(name)
+            units.append(joints.units[column])
+            cells.append(joints.cells[column][pose_rows])
+    for name in point_names:
+        header.append(name)
+        units.append(points.units[points.index(name)])
+        cells.append(_averaged(points, name, groups, position))
+
+    # pooled scatter of repeated readings
+    count = np.array([[len(rows)] for rows in groups.values()])
+    repeats = int(count.sum() - len(count))
+    if repeats:
+        squares = np.zeros(3)
+        for rows in groups.values():
+            errors = position[rows] - position[rows].mean(axis=0)
+            squares = squares + (errors**2).sum(axis=0)
         sigma = 1e3 * np.sqrt(squares / repeats)
         notes.append(f"{counted(repeats, 'repeated reading')} averaged, σ of one {np.mean(sigma):.2g} mm per axis")
-        if repeats >= MIN_REPEATS and not any(name.startswith("sigma") for name in point_names) and np.all(sigma):
-            columns |= dict(zip(SIGMA.names, (sigma / np.sqrt(count)).T))
+        has_sigma = any(name.startswith("sigma") for name in point_names)
+        if repeats >= MIN_REPEATS and not has_sigma and np.all(sigma):
+            header += SIGMA.names
             units += ["mm"] * 3
-    labels = np.array([label[k] for k in pose_rows], dtype=object)
-    header, cells = ("pose", *columns), (labels, *columns.values())
-    return Joined(Table(points.file, header, ("", *units), cells, pose_rows + 1), pose_rows, tuple(notes))
+            cells += list((sigma / np.sqrt(count)).T)
+    table = Table(points.file, tuple(header), tuple(units), tuple(cells), pose_rows + 1)
+    return Joined(table, pose_rows, tuple(notes))
 
 
 def _positions(sheet: Sheet) -> np.ndarray:
     """Return the measured positions (m, 3) [m], of several targets those of the first; NaN where it was not seen."""
     columns = sheet.family(POSITION.names) or sheet.family(POSITION.names, "1")
-    require(columns, f"has no x, y, z; found {', '.join(sheet.table.header)}", MeasurementError, sheet.table.file)
+    if not columns:
+        refuse_data(sheet.table.file, f"has no x, y, z; found {', '.join(sheet.table.header)}")
     return sheet.numbers(columns, POSITION, gaps=True)
 
 
@@ -239,14 +276,21 @@ def _consistent(
     position: np.ndarray, groups: dict[int, np.ndarray], label: Sequence[str], points: Table
 ) -> tuple[dict[int, np.ndarray], list[str]]:
     """Return the groups of readings without those whose readings contradict each other, and what is to be said."""
-    wide = {k: float(pdist(position[rows]).max()) for k, rows in groups.items() if len(rows) > 1}
-    bound = max(MAX_APART, TIMES_USUAL * float(np.median(list(wide.values()))) if len(wide) > 2 else 0.0)
-    torn = {k: distance for k, distance in wide.items() if distance > bound}
-    findings = [
-        finding("readings-apart", pose=label[k], apart=distance, rows=points.rows[groups[k]])
-        for k, distance in torn.items()
-    ]
-    return {k: rows for k, rows in groups.items() if k not in torn}, lines_of(findings)
+    distances = {}
+    for k, rows in groups.items():
+        if len(rows) > 1:
+            distances[k] = float(pdist(position[rows]).max())
+    bound = MAX_DISTANCE
+    if len(distances) > 2:
+        usual = float(np.median(list(distances.values())))
+        bound = max(bound, MAX_DISTANCE_RATIO * usual)
+    consistent = dict(groups)
+    findings = []
+    for k, distance in distances.items():
+        if distance > bound:
+            rows = consistent.pop(k)
+            findings.append(finding("readings-apart", pose=label[k], apart=distance, rows=points.rows[rows]))
+    return consistent, lines_of(findings)
 
 
 def _averaged(points: Table, name: str, groups: dict[int, np.ndarray], position: np.ndarray) -> np.ndarray:
@@ -254,69 +298,94 @@ def _averaged(points: Table, name: str, groups: dict[int, np.ndarray], position:
     cells = points.cells[points.index(name)]
     if _MEASURED.fullmatch(name) and cells.dtype == float:
         return np.array([cells[rows].mean() for rows in groups.values()])
-    away = (np.linalg.norm(position[rows] - position[rows].mean(axis=0), axis=1) for rows in groups.values())
-    return cells[[rows[np.argmin(size)] for rows, size in zip(groups.values(), away)]]
+    nearest = []
+    for rows in groups.values():
+        errors = position[rows] - position[rows].mean(axis=0)
+        distance = np.linalg.norm(errors, axis=1)
+        nearest.append(rows[np.argmin(distance)])
+    return cells[nearest]
 
 
 def _labels(joints: Table) -> list[str]:
     """Return a name per row of joints: those of its column of names, else its numbers from 1."""
     name = column_of(joints, NAMES)
-    return joints.texts(name) if name else [str(row) for row in joints.rows]
+    if name:
+        return joints.texts(name)
+    return [str(row) for row in joints.rows]
 
 
 def _same_names(joints: Table, points: Table, joint_column: str, point_column: str) -> np.ndarray:
     """Return the row of joints (m,) with each point's name, -1 without one."""
-    point_names, joint_names = points.texts(point_column), joints.texts(joint_column)
-    for plain in (_plain, _number):
-        places = {plain(text): k for k, text in enumerate(joint_names)}
-        if len(places) < len(joints):
+    point_names = points.texts(point_column)
+    joint_names = joints.texts(joint_column)
+    # first by the whole names, then by their numbers
+    for comparable in (_plain, _number):
+        rows = {comparable(text): k for k, text in enumerate(joint_names)}
+        if len(rows) < len(joints):
             refuse_data(joints.file, "has a name twice: each pose needs a name of its own", joint_column)
-        if (pose := np.array([places.get(plain(text), -1) for text in point_names])).max() >= 0:
+        pose = np.array([rows.get(comparable(text), -1) for text in point_names])
+        if pose.max() >= 0:
             break
     return pose
 
 
 def _plain(text: str) -> str:
     """Return a name in comparable form: small letters and digits, without zeros in front: ``P_007`` is ``p7``."""
-    return re.sub(r"(?<!\d)0+(?=\d)", "", re.sub(r"[^a-z0-9]", "", text.lower()))
+    plain = re.sub(r"[^a-z0-9]", "", text.lower())
+    return re.sub(r"(?<!\d)0+(?=\d)", "", plain)
 
 
 def _number(text: str) -> str:
     """Return the last number in a name, or the name where it has none."""
-    return (re.findall(r"\d+", text) or [text])[-1].lstrip("0")
+    numbers = re.findall(r"\d+", text) or [text]
+    return numbers[-1].lstrip("0")
 
 
 def _at_times(
     joints: Table, points: Table, joint_column: str, point_column: str
 ) -> tuple[Table, np.ndarray, tuple[str, ...]]:
     """Return the joints at the times of the points, which of them stood still (m,), and notes."""
-    t, at = _seconds(joints, joint_column), _seconds(points, point_column)
-    if unsorted := next((k for k, (a, b) in enumerate(pairwise(t)) if b <= a), None):
-        joints.fail("the times do not increase", joint_column, unsorted + 1)
-    in_log = (at >= t[0]) & (at <= t[-1])
+    t = _seconds(joints, joint_column)
+    point_times = _seconds(points, point_column)
+    not_after = np.flatnonzero(np.diff(t) <= 0.0)
+    if len(not_after):
+        joints.fail("the times do not increase", joint_column, int(not_after[0]) + 1)
+    in_log = (point_times >= t[0]) & (point_times <= t[-1])
     if in_log.mean() < 0.5:
-        message = f"its points are of {at.min():.10g} to {at.max():.10g} s, the joints of {t[0]:.10g} to {t[-1]:.10g} s"
+        of_points = f"{point_times.min():.10g} to {point_times.max():.10g} s"
+        message = f"its points are of {of_points}, the joints of {t[0]:.10g} to {t[-1]:.10g} s"
         refuse_data(
             points.file,
             f"{message}: are both times of the same clock? Otherwise join by motion, row or name",
             point_column,
         )
-    names = [name for name in joints.header if name != joint_column and joints.cells[joints.index(name)].dtype == float]
-    values = np.column_stack([joints.numbers(name, None) for name in names])
-    around = np.stack([_interpolated(at + shift, t, values) for shift in np.linspace(-STANDSTILL, STANDSTILL, 5)])
-    still = (np.ptp(around, axis=0) <= MAX_MOTION * np.ptp(values, axis=0) + 1e-12).all(axis=1)
-    units = tuple(joints.units[joints.index(name)] for name in names)
-    interpolated = Table(joints.file, tuple(names), units, tuple(around[2].T), points.rows)
+
+    names, units, columns = [], [], []
+    for name, unit, cells in zip(joints.header, joints.units, joints.cells):
+        if name != joint_column and cells.dtype == float:
+            names.append(name)
+            units.append(unit)
+            columns.append(joints.numbers(name, None))
+    values = np.column_stack(columns)
+    shifts = np.linspace(-STANDSTILL, STANDSTILL, 5)
+    around = np.stack([_interpolated(point_times + shift, t, values) for shift in shifts])
+    motion, travel = np.ptp(around, axis=0), np.ptp(values, axis=0)
+    still = (motion <= MAX_MOTION * travel + 1e-12).all(axis=1)
+    interpolated = Table(joints.file, tuple(names), tuple(units), tuple(around[2].T), points.rows)
+
     notes = [f"{len(points)} points, joined by time with a log of {t[-1] - t[0]:.4g} s"]
-    if (moving := in_log & ~still).any():
+    moving = in_log & ~still
+    if moving.any():
         notes.append(f"measured while the arm moved: rows {listing(points.rows[moving])}")
     if not in_log.all():
         notes.append(f"outside the log: rows {listing(points.rows[~in_log])}")
-    return interpolated, np.where(in_log & still, np.arange(len(at)), -1), tuple(notes)
+    pose = np.where(in_log & still, np.arange(len(point_times)), -1)
+    return interpolated, pose, tuple(notes)
 
 
-def _interpolated(at: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    return np.column_stack([np.interp(at, t, column) for column in values.T])
+def _interpolated(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the values (m, k) at `times` (m,) of series (N, k) at t (N,)."""
+    return np.column_stack([np.interp(times, t, column) for column in values.T])
 
 
 def _seconds(table: Table, name: str) -> np.ndarray:

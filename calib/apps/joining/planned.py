@@ -23,8 +23,10 @@ from calib.procedure.robot_kinds import joints_of
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 
-SIGMA_JOINT = 1e-4  # between a commanded and a reached joint position [rad or m] (our choice)
-STEP = 1e-6  # of the differences that propagate it [rad or m]
+# between a commanded and a reached joint position [rad or m] (our choice)
+SIGMA_JOINT = 1e-4
+# of the differences that propagate it [rad or m]
+STEP = 1e-6
 
 
 def read_planned(path: Path, chain: Chain, options: FileOptions) -> list[PoseMeasurements]:
@@ -41,19 +43,27 @@ def read_planned(path: Path, chain: Chain, options: FileOptions) -> list[PoseMea
     """
     points = read_table(path)
     sheet = Sheet(points, options)
-    forms = {*chain.joint_names, *(f"q_{name}" for name in chain.joint_names), "q1", *options.columns}
-    if forms & set(points.header) or recognises(points.header) or not sheet.family(POSITION.names):
+    position_columns = sheet.family(POSITION.names)
+    joint_columns = {*chain.joint_names, *(f"q_{name}" for name in chain.joint_names), "q1", *options.columns}
+    if joint_columns & set(points.header) or recognises(points.header) or not position_columns:
         return []
     q = read_poses(options.planned, joints_of(chain))
-    pose, notes = ordered(chain, q, points, _stated(points, len(q)), sheet)
-    plan = Table(options.planned, chain.joint_names, ("",) * chain.n, tuple(q.T), np.arange(1, len(q) + 1))
-    units = tuple(
-        sheet.unit(name, "position") if name in sheet.family(POSITION.names) else unit
-        for name, unit in zip(points.header, points.units)
-    )
-    keys = [name for name in [column_of(points, NAMES)] if name]
-    joined = merged(plan, replace(points, units=units), pose, notes, keys, name_missing=False)
+    orders = _stated_orders(points, len(q))
+    pose, notes = ordered(chain, q, points, orders, sheet)
+
+    # the planned joints in place of the controller's file
+    no_units = ("",) * chain.n
+    numbers = np.arange(1, len(q) + 1)
+    plan = Table(options.planned, chain.joint_names, no_units, tuple(q.T), numbers)
+    units = list(points.units)
+    for name in position_columns:
+        units[points.index(name)] = sheet.unit(name, "position")
+    name_column = column_of(points, NAMES)
+    keys = {name_column} - {""}
+    joined = merged(plan, replace(points, units=tuple(units)), pose, notes, keys, name_missing=False)
     (block,) = read_measurements(joined.table, joints_of(chain), replace(options, units={}))
+
+    # the arm stops beside where it was sent
     sigma = _stop_sigma(chain, block.q)
     note = finding("joints-planned", sigma=np.sqrt(np.mean(3.0 * sigma**2)))
     block = replace(block, notes=(*lines_of([note]), *joined.notes, *block.notes))
@@ -62,24 +72,39 @@ def read_planned(path: Path, chain: Chain, options: FileOptions) -> list[PoseMea
     return [block]
 
 
-def _stated(points: Table, count: int) -> dict[str, np.ndarray]:
+def _stated_orders(points: Table, count: int) -> dict[str, np.ndarray]:
     """Return the orders that the file itself may state, in words → (m,) index of the pose."""
-    numbers, orders = np.arange(len(points)), dict[str, np.ndarray]()
-    starts = range(max(count - len(points), 0) + 1) if len(points) >= MIN_POINTS else ()
-    for start in starts:  # a run that was interrupted goes on somewhere
-        origin = f"in the order of the list{f' from pose {start + 1} on' if start else ''}"
-        orders[origin] = np.where(numbers + start < count, numbers + start, -1)
-    if name := column_of(points, NAMES):
-        digit_lists = [re.findall(r"\d+", text)[-1:] for text in points.texts(name)]
-        numbered = np.array([int(digits[0]) - 1 if digits else -1 for digits in digit_lists])
-        orders = {"by the numbers in their names": np.where(numbered < count, numbered, -1)} | orders
+    orders = dict[str, np.ndarray]()
+    name = column_of(points, NAMES)
+    if name:
+        numbered = []
+        for text in points.texts(name):
+            digits = re.findall(r"\d+", text)
+            numbered.append(int(digits[-1]) - 1 if digits else -1)
+        orders["by the numbers in their names"] = _in_plan(np.array(numbered), count)
+    if len(points) < MIN_POINTS:
+        return orders
+    # a run that was interrupted goes on somewhere
+    for start in range(max(count - len(points), 0) + 1):
+        origin = "in the order of the list"
+        if start:
+            origin += f" from pose {start + 1} on"
+        orders[origin] = _in_plan(np.arange(len(points)) + start, count)
     return orders
+
+
+def _in_plan(pose: np.ndarray, count: int) -> np.ndarray:
+    """Return the indices of poses, -1 for those beyond the `count` planned ones."""
+    return np.where(pose < count, pose, -1)
 
 
 def _stop_sigma(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return the standard deviation (m,) [m] per axis of the tip's position from `SIGMA_JOINT` at each joint."""
-    differences = [
-        forward(chain, q + STEP * axis)[:, :3, 3] - forward(chain, q - STEP * axis)[:, :3, 3]
-        for axis in np.eye(chain.n)
-    ]
-    return SIGMA_JOINT * np.sqrt(np.sum(np.square(differences), axis=(0, 2)) / 3.0) / (2.0 * STEP)
+    squares = []
+    for axis in np.eye(chain.n):
+        ahead = forward(chain, q + STEP * axis)
+        behind = forward(chain, q - STEP * axis)
+        difference = ahead[:, :3, 3] - behind[:, :3, 3]
+        squares.append(np.square(difference))
+    rms = np.sqrt(np.sum(squares, axis=(0, 2)) / 3.0)
+    return SIGMA_JOINT * rms / (2.0 * STEP)

@@ -9,7 +9,7 @@ many are held as the resolution asks for, and `HELD` at most, so that memory is 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from itertools import islice, pairwise
@@ -20,14 +20,21 @@ import numpy as np
 from calib.apps.joining.joined import CLOCKS, column_of
 from calib.data.csv_table import Table, opened, plain_rows, split_units
 from calib.data.signals.resampling import GAP
-from calib.errors import MeasurementError, counted, listing, refuse_data, refused_as, require
+from calib.errors import MeasurementError, counted, listing, refuse_data, refused_as
 from calib.units import TIMES
 
-PIECE = 50_000  # rows read at once (our choice)
-HELD = 500_000  # rows held, at most: beyond them every second one (our choice)
-SLOWEST = 0.2  # time between two rows of a stream, at most [s] (our choice)
-MIN_ROWS = 200  # of a stream (our choice)
-RESTART = 1.0  # by which a clock that was restarted goes back, at least [s] (our choice)
+# Thresholds are our choice.
+# rows read at once
+PIECE = 50_000
+# rows held, at most: beyond them every second one
+HELD = 500_000
+# time between two rows of a stream, at most [s]
+SLOWEST = 0.2
+# of a stream
+MIN_ROWS = 200
+# by which a clock that was restarted goes back, at least [s]
+RESTART = 1.0
+# reasons for which rows are left out
 DAMAGED, LATE = "damaged, empty or not seen", "with a time not after the row before"
 
 
@@ -60,15 +67,16 @@ class Stream:
 
     def lines(self) -> list[str]:
         """Return what is to be said of the file's rows."""
-        intervals = np.diff(self.t)
-        reasons = [f"{count} {reason}" for reason, count in self.dropped.items() if count]
-        lines = [f"{Path(self.file).name}: {self.read} rows, {self.t[-1] - self.t[0]:.4g} s"]
+        name = Path(self.file).name
+        summary = f"{name}: {self.read} rows, {self.t[-1] - self.t[0]:.4g} s"
+        reasons = _reasons(self.dropped)
         if reasons:
-            lines[0] += f"; left out: {', '.join(reasons)}"
-        if gaps := int((intervals > self.gap).sum()):
-            lines.append(
-                f"{Path(self.file).name}: {counted(gaps, 'gap')} not bridged, the longest {intervals.max():.3g} s"
-            )
+            summary += f"; left out: {reasons}"
+        lines = [summary]
+        intervals = np.diff(self.t)
+        gaps = int((intervals > self.gap).sum())
+        if gaps:
+            lines.append(f"{name}: {counted(gaps, 'gap')} not bridged, the longest {intervals.max():.3g} s")
         return lines
 
 
@@ -91,6 +99,34 @@ class Kind:
     resolution: float
 
 
+@dataclass(frozen=True)
+class _Jump:
+    """A jump of a file's clock by more than `RESTART`: number of the row after it, times before and after [s]."""
+
+    row: int
+    before: float
+    after: float
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """Times (m,), values (m, k) and numbers (m,) of the rows that are held of a piece."""
+
+    t: np.ndarray
+    values: np.ndarray
+    rows: np.ndarray
+
+    def every(self, stride: int) -> _Part:
+        """Return every so many of the file's rows."""
+        multiple = (self.rows - 1) % stride == 0
+        return _Part(self.t[multiple], self.values[multiple], self.rows[multiple])
+
+
+def _reasons(dropped: Counter[str]) -> str:
+    """Return how many rows are left out for each reason; empty where none is."""
+    return ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count)
+
+
 def read_stream(path: Path, kind: Kind) -> Stream:
     """Return the rows of the file at `path` that can be used.
 
@@ -98,105 +134,147 @@ def read_stream(path: Path, kind: Kind) -> Stream:
         MeasurementError: for a file without times, one that was measured at stops, one whose clock was restarted, and
             one of which most rows cannot be used.
     """
-    parts, dropped, last, stride, read = list[tuple[np.ndarray, ...]](), Counter[str](), -np.inf, 0, 0
-    jumps, latest = list[tuple[int, float, float]](), np.nan
+    dropped = Counter[str]()
+    jumps = list[_Jump]()
+    parts = list[_Part]()
+    # every so many rows are held; 0 until the time between two is known
+    stride = 0
+    read = 0
+    largest, latest = -np.inf, np.nan
     for table in _pieces(path):
         t, values, sound = _piece(table, kind)
-        before = np.maximum.accumulate(np.concatenate([[last], np.where(sound, t, -np.inf)]))
+        read += len(t)
+
+        # a row is late unless its time is after all times before
+        sound_times = np.where(sound, t, -np.inf)
+        before = np.maximum.accumulate(np.concatenate([[largest], sound_times]))
         ahead = sound & (t > before[:-1])
-        dropped.update({DAMAGED: int((~sound).sum()), LATE: int((sound & ~ahead).sum())})
-        last, read = before[-1], read + len(t)
+        largest = before[-1]
+        dropped[DAMAGED] += int((~sound).sum())
+        dropped[LATE] += int((sound & ~ahead).sum())
+
         times = np.concatenate([[latest], t[sound]])
-        jump_rows = np.flatnonzero(np.abs(np.diff(times)) > RESTART)
-        jumps += zip(table.rows[sound][jump_rows].tolist(), times[jump_rows].tolist(), times[jump_rows + 1].tolist())
         latest = times[-1]
+        for k in np.flatnonzero(np.abs(np.diff(times)) > RESTART):
+            row = int(table.rows[sound][k])
+            jumps.append(_Jump(row, float(times[k]), float(times[k + 1])))
+
         if not stride and ahead.sum() > 1:
-            stride = max(int(kind.resolution / _step(t[ahead], table) + 0.01), 1)
+            step = _step(t[ahead], table)
+            stride = max(int(kind.resolution / step + 0.01), 1)
         thinned = ahead & ((table.rows - 1) % max(stride, 1) == 0)
-        parts.append((t[thinned], values[thinned], table.rows[thinned]))
-        if sum(len(part[0]) for part in parts) > HELD:
+        parts.append(_Part(t[thinned], values[thinned], table.rows[thinned]))
+        if sum(len(part.t) for part in parts) > HELD:
             stride *= 2
-            parts = [tuple(times[(part[2] - 1) % stride == 0] for times in part) for part in parts]
-    _refuse_restart(path, [*jumps, (read + 1, np.nan, -np.inf)])
-    if read - sum(dropped.values()) < max(MIN_ROWS, read / 2):
-        reasons = ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count)
-        message = f"only {read - sum(dropped.values())} of {read} rows can be used{reasons and f' ({reasons})'}"
+            parts = [part.every(stride) for part in parts]
+
+    _refuse_restart(path, [*jumps, _Jump(read + 1, np.nan, -np.inf)])
+    usable = read - sum(dropped.values())
+    if usable < max(MIN_ROWS, read / 2):
+        message = f"only {usable} of {read} rows can be used"
+        reasons = _reasons(dropped)
+        if reasons:
+            message += f" ({reasons})"
         refuse_data(path, f"{message}: is it a stream, and one recording?")
-    t, values, rows = (np.concatenate(columns) for columns in zip(*(part for part in parts if len(part[0]))))
-    return Stream(str(path), t, values, rows, float(np.median(np.diff(t))), read, dropped)
+    parts = [part for part in parts if len(part.t)]
+    t = np.concatenate([part.t for part in parts])
+    values = np.concatenate([part.values for part in parts])
+    rows = np.concatenate([part.rows for part in parts])
+    step = float(np.median(np.diff(t)))
+    return Stream(str(path), t, values, rows, step, read, dropped)
 
 
-def _refuse_restart(path: Path, jumps: Sequence[tuple[int, float, float]]) -> None:
+def _refuse_restart(path: Path, jumps: Sequence[_Jump]) -> None:
     """Refuse a file whose times go back and do not return: those of a copied block of rows do.
 
     Args:
-        jumps: row, time before it and its own [s] of each jump by more than `RESTART`; the file's end as the last one.
+        jumps: each jump by more than `RESTART`; the file's end as the last one.
     """
-    for (row, before, after), (end, _, then) in pairwise(jumps):
-        if after < before and then < before - RESTART and end - row >= MIN_ROWS:
-            message = f"its times go back from {before:.3f} to {after:.3f} s and run on from there: the clock restarted"
-            refuse_data(path, f"{message}. Split the file there, and join each part on its own", row=row)
+    for jump, following in pairwise(jumps):
+        returns = following.after >= jump.before - RESTART
+        if jump.after < jump.before and not returns and following.row - jump.row >= MIN_ROWS:
+            times = f"{jump.before:.3f} to {jump.after:.3f} s"
+            message = f"its times go back from {times} and run on from there: the clock restarted"
+            refuse_data(path, f"{message}. Split the file there, and join each part on its own", row=jump.row)
 
 
 def _piece(table: Table, kind: Kind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return times (m,) [s] and values (m, k) [SI] of a table, and which rows (m,) can be."""
-    clock, names = _clock(table), kind.names(table)
-    t = table.cells[table.index(clock)] * table.factor(table.index(clock), TIMES, "")
-    sound_rows = np.ones(len(t), dtype=bool)
-    for cells in (t, *(table.cells[table.index(name)] for name in names)):
-        sound_rows &= np.isfinite(cells)
-    sound_rows[1:-1] &= ~((t[1:-1] > t[2:]) & (t[2:] > t[:-2]))  # one time too late, not all that follow
-    sound_values = kind.values(table.where(sound_rows))
-    sound = kind.sound(sound_values)
-    if len(sound_values) and sound.mean() < 0.5:
-        kind.refuse(table.where(sound_rows), sound_values)
-    values = np.full((len(t), sound_values.shape[1]), np.nan)
-    values[sound_rows] = sound_values
-    sound_rows[sound_rows] = sound
-    return t, values, sound_rows
+    clock = table.index(_clock(table))
+    t = table.cells[clock] * table.factor(clock, TIMES, "")
+    sound = np.isfinite(t)
+    for name in kind.names(table):
+        sound &= np.isfinite(table.cells[table.index(name)])
+    # one time too late, not all that follow
+    too_late = (t[1:-1] > t[2:]) & (t[2:] > t[:-2])
+    sound[1:-1] &= ~too_late
+    finite_rows = table.where(sound)
+    finite_values = kind.values(finite_rows)
+    possible = kind.sound(finite_values)
+    if len(finite_values) and possible.mean() < 0.5:
+        kind.refuse(finite_rows, finite_values)
+    values = np.full((len(t), finite_values.shape[1]), np.nan)
+    values[sound] = finite_values
+    sound[sound] = possible
+    return t, values, sound
 
 
 def _clock(table: Table) -> str:
-    found_columns = f"found {listing(table.header)}. What was measured at stops is joined by name, time or row"
-    message = f"has no column of times ({', '.join(CLOCKS)}); {found_columns}"
-    require(clock := column_of(table, CLOCKS), message, MeasurementError, table.file)
+    """Return the name of the column of times."""
+    clock = column_of(table, CLOCKS)
+    if not clock:
+        columns = f"found {listing(table.header)}. What was measured at stops is joined by name, time or row"
+        refuse_data(table.file, f"has no column of times ({', '.join(CLOCKS)}); {columns}")
     return clock
 
 
 def _step(t: np.ndarray, table: Table) -> float:
     """Return the time between rows [s]; refuse a file that was measured at stops."""
     step = float(np.median(np.diff(t)))
-    message = f"its rows are {step:.3g} s apart, a stream's {SLOWEST:g} s at most. Is t in ms ('t [ms]')?"
     if step > SLOWEST:
+        message = f"its rows are {step:.3g} s apart, a stream's {SLOWEST:g} s at most. Is t in ms ('t [ms]')?"
         refuse_data(table.file, f"{message} What was measured at stops is joined by name, time or row", _clock(table))
     return step
 
 
 def _pieces(path: Path) -> Iterator[Table]:
     """Yield the table at `path` in pieces of at most `PIECE` rows; what is no number is NaN, and a date its seconds."""
-    first_row = 0
+    first_row = 1
     with (
         refused_as(MeasurementError, UnicodeDecodeError, "is no UTF-8 text ({}): is the copy complete?", path),
         opened(path, True) as (lines, separator, cells),
     ):
         names, units = split_units(cells)
-        body = (line for line in lines if (text := line.strip()) and text[0] != "#")
+        body = _data_lines(lines)
         while block := list(islice(body, PIECE)):
             numbers = plain_rows(block, separator, len(names))
             if numbers is None:
                 numbers = np.array([_row(line, separator, len(names)) for line in block])
-            yield Table(str(path), names, units, tuple(numbers.T), np.arange(first_row, first_row + len(numbers)) + 1)
+            rows = np.arange(first_row, first_row + len(numbers))
+            yield Table(str(path), names, units, tuple(numbers.T), rows)
             first_row += len(numbers)
-    require(first_row, "has a header but no data rows", MeasurementError, path)
+    if first_row == 1:
+        refuse_data(path, "has a header but no data rows")
+
+
+def _data_lines(lines: Iterable[str]) -> Iterator[str]:
+    """Yield the lines that are neither empty nor comments."""
+    for line in lines:
+        text = line.strip()
+        if text and text[0] != "#":
+            yield line
 
 
 def _row(line: str, separator: str, width: int) -> list[float]:
     """Return the numbers of a line; NaN for all of one that has other than `width` cells."""
     cells = line.split() if separator == " " else line.split(separator)
-    return [_number(cell.strip(' "\r\n')) for cell in cells] if len(cells) == width else [np.nan] * width
+    if len(cells) != width:
+        return [np.nan] * width
+    return [_number(cell.strip(' "\r\n')) for cell in cells]
 
 
 def _number(cell: str) -> float:
+    """Return the number in a cell, or the seconds of a date and time; NaN for anything else."""
     try:
         return float(cell)
     except ValueError:

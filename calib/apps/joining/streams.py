@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from calib.data.poses.columns import LATE, POSITION, QUATERNION, Sheet
 from calib.data.poses.measurements import PoseMeasurements
 from calib.data.poses.plausible import check_joints, outside, unit_quaternions
 from calib.data.schema import BOUNDS, max_travel
-from calib.errors import Finding, MeasurementError, finding, refuse_data, require
+from calib.errors import Finding, finding, refuse_data
 from calib.estimation import robust
 from calib.estimation.whiteness import autocorrelation, inflation
 from calib.geometry.installation import Installation
@@ -35,14 +35,24 @@ from calib.records import evenly
 from calib.robot.chain import Chain, joint_kinds
 from calib.units import JOINT
 
-RESOLUTION, LOG_RESOLUTION = 0.004, 0.008  # time between the rows that are held, of instrument and log [s]
-MIN_MOTION = 1e-3  # travel of a joint [rad or m] and of the points [m]
-FITTED = 1500  # rows that clock and geometry are fitted to first
-OUTLIER = 6.0  # robust sigmas
-MIN_ROWS, MAX_ROWS = 20, 20_000  # of the table
-MOVED = 1e-3  # by which a joint moves at least between two rows of the table [rad or m]
-MAX_WANDER = 5e-3  # by which a clock may leave a line of offset and drift [s]
-WORTH_SAYING = 1.05  # times that σ of a fit to all rows would be too small
+# time between the rows that are held, of instrument and log [s]
+RESOLUTION, LOG_RESOLUTION = 0.004, 0.008
+# travel of a joint [rad or m] and of the points [m]
+MIN_MOTION = 1e-3
+# rows that clock and geometry are fitted to first
+FITTED = 1500
+# robust sigmas
+OUTLIER = 6.0
+# of the table
+MIN_ROWS, MAX_ROWS = 20, 20_000
+# rows that are searched at once for one in which the arm has moved
+PIECE = 64
+# by which a joint moves at least between two rows of the table [rad or m]
+MOVED = 1e-3
+# by which a clock may leave a line of offset and drift [s]
+MAX_WANDER = 5e-3
+# times that σ of a fit to all rows would be too small
+WORTH_SAYING = 1.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,67 +85,118 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
     Raises:
         MeasurementError: where the files are no streams, the arm hardly moves, or the two do not belong together.
     """
-    log, stream = read_stream(log_file, _joints(chain)), _fresh(read_stream(file, _target()))
-    for recording, k, unit in ((log, chain.n, ""), (stream, 3, " m")):
-        travel = float(np.ptp(recording.values[:, :k], axis=0).max())
-        message = f"hardly moves (by {travel:.2g}{unit}), and without motion no clock is found: is the unit right?"
-        require(travel > MIN_MOTION, message, MeasurementError, recording.file)
-    turn = stream.values[:, 3:] if stream.values.shape[1] > 3 else None
-    q, names = np.zeros((len(stream.t), chain.n)), chain.joint_names
-    run = Run(log, stream, PoseMeasurements.of(q, stream.values[:, :3], turn, joint_names=names, file=str(file)))
+    log = read_stream(log_file, _joints(chain))
+    stream = _fresh(read_stream(file, _target()))
+    _check_motion(log, chain.n, "")
+    _check_motion(stream, 3, " m")
+    positions = stream.values[:, :3]
+    turns = stream.values[:, 3:] if stream.values.shape[1] > 3 else None
+    no_joints = np.zeros((len(stream.t), chain.n))
+    points = PoseMeasurements.of(no_joints, positions, turns, joint_names=chain.joint_names, file=str(file))
+    run = Run(log, stream, points)
+
+    # clock and arm are first fitted to rows whose residuals are correlated
     nominal, clock, rivals = begin(chain, run)
     cell, clock, equations = fitted(nominal, run, run.known(clock, FITTED), clock)
     step, wander = find_step(equations)
     if step or wander > MAX_WANDER:
         _refuse(step, wander, run, clock)
     usable, errors, velocity, findings = _usable(cell, run, clock)
-    tau, sigma = max(inflation(row) for row in errors), robust.spread(errors[:3])
-    chosen, spacing = _thinned(stream.t[usable], run.joints(clock, usable), stream.step * (1.0 + 1.5 * (tau - 1.0)))
-    rows, neighbour_correlation = usable[chosen], max(float(autocorrelation(row, 1)[0]) for row in errors[:, chosen])
-    figures: dict[str, Any] = {
-        "sigma": sigma,
-        "correlation": tau * stream.step,
-        "factor": float(np.sqrt(tau)),
-        "left": neighbour_correlation,
-    }
-    stated_figures = spacing | figures | {"factor": figures["factor"] if figures["factor"] > WORTH_SAYING else None}
-    thinned = finding("stream-thinned", taken=len(rows), of=len(usable), step=stream.step, **stated_figures)
+    tau = max(inflation(row) for row in errors)
+    sigma = robust.spread(errors[:3])
+    min_interval = stream.step * (1.0 + 1.5 * (tau - 1.0))
+    chosen, spacing = _thinned(stream.t[usable], run.joints(clock, usable), min_interval)
+    rows = usable[chosen]
+    correlations = [float(autocorrelation(row, 1)[0]) for row in errors[:, chosen]]
+    neighbour_correlation = max(correlations)
+    correlation_time = tau * stream.step
+    factor = float(np.sqrt(tau))
+    thinned = finding(
+        "stream-thinned",
+        taken=len(rows),
+        of=len(usable),
+        step=stream.step,
+        **spacing,
+        sigma=sigma,
+        correlation=correlation_time,
+        factor=factor if factor > WORTH_SAYING else None,
+        left=neighbour_correlation,
+    )
     if len(rows) < MIN_ROWS:
+        notes = "; ".join([*run.lines(), *lines_of([thinned])])
         message = (
             "too few rows are independent: did a clock jump, or instrument or target move? Else measure for longer"
         )
-        refuse_data(file, f"{message}, over more of the workspace ({'; '.join([*run.lines(), *lines_of([thinned])])})")
+        refuse_data(file, f"{message}, over more of the workspace ({notes})")
+
+    # then to independent ones; neighbours are alike in what changes slowly
     few = rows[evenly(len(rows), FITTED)]
-    _, clock, _ = fitted(nominal, run, few, clock, play=True)
-    alike = float(
-        np.sqrt((1.0 + max(neighbour_correlation, 0.0)) / (1.0 - max(neighbour_correlation, 0.0)))
-    )  # of neighbours, for what changes slowly
+    _, clock, _ = fitted(nominal, run, few, clock, backlash=True)
+    correlation = max(neighbour_correlation, 0.0)
+    alike = float(np.sqrt((1.0 + correlation) / (1.0 - correlation)))
     clock = replace(clock, sigma=alike * clock.sigma, drift_sigma=alike * clock.drift_sigma)
-    position_error = clock.sigma * float(np.sqrt(np.mean(np.sum(velocity**2, axis=0))))
-    message = (
-        f"the offset of its clock is known to {1e3 * clock.sigma:.2g} ms only, in which the target moves by "
-        f"{1e3 * position_error:.2g} mm (noise {1e3 * sigma:.2g} mm): measure for longer, each way forth and back"
+    rms_speed = float(np.sqrt(np.mean(np.sum(velocity**2, axis=0))))
+    position_error = clock.sigma * rms_speed
+    if not position_error < sigma:
+        refuse_data(
+            file,
+            f"the offset of its clock is known to {1e3 * clock.sigma:.2g} ms only, in which the target moves by "
+            f"{1e3 * position_error:.2g} mm (noise {1e3 * sigma:.2g} mm): measure for longer, each way forth and back",
+        )
+
+    if rivals:
+        findings.append(finding("stream-repeats", offsets=rivals))
+    if wander:
+        findings.append(finding("stream-wanders", away=wander))
+    first_time = stream.t[:1]
+    first = stream.t[0] - float(clock.controller(first_time)[0])
+    findings.append(
+        finding(
+            "stream-clock",
+            first=first,
+            offset=clock.offset,
+            sigma=clock.sigma,
+            drift=clock.drift,
+            drift_sigma=clock.drift_sigma,
+            middle=clock.middle,
+            ppm=1e6 * clock.drift,
+            ppm_sigma=1e6 * clock.drift_sigma,
+        )
     )
-    require(position_error < sigma, message, MeasurementError, file)
-    findings += [finding("stream-repeats", offsets=rivals)] if rivals else []
-    findings += [finding("stream-wanders", away=wander)] if wander else []
-    first = stream.t[0] - float(clock.controller(stream.t[:1])[0])
-    ppm = {"ppm": 1e6 * clock.drift, "ppm_sigma": 1e6 * clock.drift_sigma}
-    findings += [finding("stream-clock", first=first, **vars(clock) | ppm)]
     notes = (*run.lines(), *lines_of([*findings, thinned]))
-    table = _table(chain, run.joints(clock, rows), stream, rows, velocities(cell, run, rows, clock)[:3])
-    return Streamed(table, stream.rows[rows] - 1, notes, clock, **figures)
+    row_velocities = velocities(cell, run, rows, clock)[:3]
+    table = _table(chain, run.joints(clock, rows), stream, rows, row_velocities)
+    return Streamed(
+        table,
+        stream.rows[rows] - 1,
+        notes,
+        clock,
+        sigma=sigma,
+        correlation=correlation_time,
+        factor=factor,
+        left=neighbour_correlation,
+    )
+
+
+def _check_motion(recording: Stream, count: int, unit: str) -> None:
+    """Refuse a recording whose first `count` columns hardly change."""
+    travel = float(np.ptp(recording.values[:, :count], axis=0).max())
+    if not travel > MIN_MOTION:
+        message = f"hardly moves (by {travel:.2g}{unit}), and without motion no clock is found: is the unit right?"
+        refuse_data(recording.file, message)
 
 
 def _refuse(step: Step | None, wander: float, run: Run, clock: Clock) -> NoReturn:
     """Refuse recordings in which a clock steps, or wanders."""
+    file = run.stream.file
     if step is None:
         message = f"the clocks' offset leaves a line of offset and drift by {1e3 * wander:.2g} ms"
-        refuse_data(run.stream.file, f"{message}: cut the file into shorter parts, and join each part on its own")
+        refuse_data(file, f"{message}: cut the file into shorter parts, and join each part on its own")
     size = f"{1e3 * step.size:+.3g} ± {1e3 * step.sigma:.2g} ms"
+    log_time = float(clock.controller(np.array(step.time)))
+    location = step.place(run.log, run.stream, log_time)
     message = f"the instrument's clock steps by {size} against the controller's"
-    location = step.place(run.log, run.stream, float(clock.controller(np.array(step.time))))
-    refuse_data(run.stream.file, f"{message} ({location}): cut the file there, and join each part on its own")
+    refuse_data(file, f"{message} ({location}): cut the file there, and join each part on its own")
 
 
 def _usable(cell: Installation, run: Run, clock: Clock) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Finding]]:
@@ -143,34 +204,45 @@ def _usable(cell: Installation, run: Run, clock: Clock) -> tuple[np.ndarray, np.
 
     Residuals have the variance σ² across the motion, and σ² + v² σ_t² along it.
     """
-    stream, usable = run.stream, run.known(clock)
-    errors = residuals(cell, run, usable, clock)
-    consistent = (np.abs(errors) < OUTLIER * np.array([[robust.spread(row)] for row in errors])).all(axis=0)
+    stream = run.stream
+    usable = run.known(clock)
     stream.dropped["outside the log or in its gaps"] = len(stream.t) - len(usable)
+
+    errors = residuals(cell, run, usable, clock)
+    bounds = OUTLIER * np.array([[robust.spread(row)] for row in errors])
+    consistent = (np.abs(errors) < bounds).all(axis=0)
     stream.dropped["far from the arm's path"] = int((~consistent).sum())
     usable, errors = usable[consistent], errors[:, consistent]
+
     velocity = np.gradient(stream.values[usable, :3], stream.t[usable], axis=0).T
     speed = np.linalg.norm(velocity, axis=0)
     along = (errors[:3] * velocity).sum(axis=0) / np.maximum(speed, 1e-9)
-    across = (np.sum(errors[:3] ** 2, axis=0) - along**2) / 2.0
-    time_sigma = np.sqrt(max(float(np.sum(speed**2 * (along**2 - across)) / np.sum(speed**4)), 1e-24))
-    sigma = float(np.sqrt(across.mean()))
+    across_variance = (np.sum(errors[:3] ** 2, axis=0) - along**2) / 2.0
+    excess = np.sum(speed**2 * (along**2 - across_variance))
+    time_sigma = np.sqrt(max(float(excess / np.sum(speed**4)), 1e-24))
+    sigma = float(np.sqrt(across_variance.mean()))
     slow = speed * time_sigma <= sigma
     stream.dropped["too fast"] = int((~slow).sum())
-    findings = [] if slow.all() else [finding("stream-fast", speed=sigma / time_sigma, late=time_sigma, sigma=sigma)]
+    findings = list[Finding]()
+    if not slow.all():
+        findings.append(finding("stream-fast", speed=sigma / time_sigma, late=time_sigma, sigma=sigma))
     return usable[slow], errors[:, slow], velocity[:, slow], findings
 
 
 def _joints(chain: Chain) -> Kind:
     """Return how a log's joints are read."""
     robot = joints_of(chain)
+    # limits, and for a joint without any a bound of the right unit
     travel = max_travel(robot.kinds)
-    low, high = (
-        np.where(np.isfinite(limit), limit, side * travel) for limit, side in ((robot.lower, -1), (robot.upper, 1))
-    )
+    low = np.where(np.isfinite(robot.lower), robot.lower, -1 * travel)
+    high = np.where(np.isfinite(robot.upper), robot.upper, travel)
 
     def names(table: Table) -> tuple[str, ...]:
         return Sheet(table).find_joints(robot.names)
+
+    def values(table: Table) -> np.ndarray:
+        q, *_ = Sheet(table).joints(robot.names)
+        return q
 
     def sound(q: np.ndarray) -> np.ndarray:
         return np.all(~outside(q, low, high), axis=1)
@@ -178,24 +250,32 @@ def _joints(chain: Chain) -> Kind:
     def refuse(table: Table, q: np.ndarray) -> None:
         check_joints(q, Sheet(table), names(table), robot)
 
-    return Kind(names, lambda table: Sheet(table).joints(robot.names)[0], sound, refuse, LOG_RESOLUTION)
+    return Kind(names, values, sound, refuse, LOG_RESOLUTION)
 
 
 def _target() -> Kind:
     """Return how an instrument's positions [m], and its quaternions where it has some, are read."""
 
     def names(table: Table) -> tuple[str, ...]:
-        position_columns = Sheet(table).family(POSITION.names)
-        require(position_columns, f"has no x, y, z; found {', '.join(table.header)}", MeasurementError, table.file)
-        return (*position_columns, *Sheet(table).family(QUATERNION.names))
+        sheet = Sheet(table)
+        position_columns = sheet.family(POSITION.names)
+        if not position_columns:
+            refuse_data(table.file, f"has no x, y, z; found {', '.join(table.header)}")
+        return (*position_columns, *sheet.family(QUATERNION.names))
 
     def values(table: Table) -> np.ndarray:
-        return np.column_stack([table.numbers(name, "" if k > 2 else "length") for k, name in enumerate(names(table))])
+        columns = [table.numbers(name, "length") for name in names(table)[:3]]
+        columns += [table.numbers(name, "") for name in names(table)[3:]]
+        return np.column_stack(columns)
 
     def sound(values: np.ndarray) -> np.ndarray:
         position, turn = values[:, :3], values[:, 3:]
-        unit = np.abs(np.linalg.norm(turn, axis=1) - 1.0) <= BOUNDS.max_norm_error
-        return (np.abs(position) <= BOUNDS.max_length).all(axis=1) & position.any(axis=1) & (unit | (not turn.size))
+        within_bounds = (np.abs(position) <= BOUNDS.max_length).all(axis=1)
+        sound_rows = within_bounds & position.any(axis=1)
+        if not turn.size:
+            return sound_rows
+        norm_error = np.abs(np.linalg.norm(turn, axis=1) - 1.0)
+        return sound_rows & (norm_error <= BOUNDS.max_norm_error)
 
     def refuse(table: Table, values: np.ndarray) -> None:
         POSITION.check(values[:, :3], table, names(table)[:3])
@@ -207,9 +287,10 @@ def _target() -> Kind:
 
 def _fresh(stream: Stream) -> Stream:
     """Return the stream without readings that repeat the one before: nothing new was seen."""
-    new = np.concatenate([[True], np.diff(stream.values, axis=0).any(axis=1)])
-    stream.dropped["repeating the reading before"] = int((~new).sum())
-    return replace(stream, t=stream.t[new], values=stream.values[new], rows=stream.rows[new])
+    changed = np.diff(stream.values, axis=0).any(axis=1)
+    fresh = np.concatenate([[True], changed])
+    stream.dropped["repeating the reading before"] = int((~fresh).sum())
+    return replace(stream, t=stream.t[fresh], values=stream.values[fresh], rows=stream.rows[fresh])
 
 
 def _thinned(t: np.ndarray, q: np.ndarray, min_interval: float) -> tuple[np.ndarray, dict[str, float | None]]:
@@ -217,31 +298,52 @@ def _thinned(t: np.ndarray, q: np.ndarray, min_interval: float) -> tuple[np.ndar
 
     Second: `apart`, the median time between them [s], and what made it longer: `most` rows, or that a joint `moved`.
     """
-    step, full = float(np.median(np.diff(t))), float(t[-1] - t[0]) / MAX_ROWS
-    capped, min_interval, chosen, after, ahead = (
-        full > 0.999 * min_interval,
-        max(0.999 * min_interval, full),
-        [0],
-        0,
-        64,
-    )
-    while (after := max(after, int(np.searchsorted(t, t[chosen[-1]] + min_interval)))) < len(t):
-        moving = np.flatnonzero(np.abs(q[after : after + ahead] - q[chosen[-1]]).max(axis=1) > MOVED)
-        chosen += (after + moving[:1]).tolist()
-        after += 0 if len(moving) else ahead
+    step = float(np.median(np.diff(t)))
+    full = float(t[-1] - t[0]) / MAX_ROWS
+    # stamps are rounded: an interval may be a little shorter
+    min_interval = 0.999 * min_interval
+    capped = full > min_interval
+    min_interval = max(min_interval, full)
+    chosen = [0]
+    after = 0
+    while True:
+        earliest = int(np.searchsorted(t, t[chosen[-1]] + min_interval))
+        after = max(after, earliest)
+        if after >= len(t):
+            break
+        travel = np.abs(q[after : after + PIECE] - q[chosen[-1]]).max(axis=1)
+        moving = np.flatnonzero(travel > MOVED)
+        if len(moving):
+            chosen.append(after + int(moving[0]))
+        else:
+            after += PIECE
     rows = np.array(chosen)
-    interval = float(np.median(np.diff(t[rows]))) if len(rows) > 1 else min_interval
+    interval = min_interval
+    if len(rows) > 1:
+        interval = float(np.median(np.diff(t[rows])))
     still = interval > min_interval + 1.5 * step
-    max_rows, moving = MAX_ROWS if capped and not still else None, 1e3 * MOVED if still else None
-    return rows, {"apart": interval, "most": max_rows, "moved": moving}
+    max_rows = MAX_ROWS if capped and not still else None
+    min_travel = 1e3 * MOVED if still else None
+    return rows, {"apart": interval, "most": max_rows, "moved": min_travel}
 
 
 def _table(chain: Chain, q: np.ndarray, stream: Stream, rows: np.ndarray, velocity: np.ndarray) -> Table:
     """Return rows of a stream with their joints q (m, n) and velocities (3, m) as a table of measured poses."""
-    units = [JOINT["prismatic" if kind == "prismatic" else "revolute"] for kind in joint_kinds(chain)]
-    turn = QUATERNION.names if stream.values.shape[1] > 3 else ()
-    header = ("time", *chain.joint_names, *POSITION.names, *turn, *LATE.names)
-    cells = (stream.t[rows], *(q * [factor for factor, _ in units]).T, *(1e3 * stream.values[rows, :3]).T)
-    cells += (*stream.values[rows, 3:].T, *(1e3 * velocity))
-    column_units = ("s", *(unit for _, unit in units), *("mm",) * 3, *("",) * len(turn), *("mm/s",) * 3)
-    return Table(stream.file, header, column_units, cells, stream.rows[rows])
+    header, units, cells = ["time"], ["s"], [stream.t[rows]]
+    for name, kind, series in zip(chain.joint_names, joint_kinds(chain), q.T):
+        factor, unit = JOINT["prismatic" if kind == "prismatic" else "revolute"]
+        header.append(name)
+        units.append(unit)
+        cells.append(series * factor)
+    header += POSITION.names
+    units += ["mm"] * 3
+    cells += list(1e3 * stream.values[rows, :3].T)
+    turns = stream.values[rows, 3:].T
+    if len(turns):
+        header += QUATERNION.names
+        units += [""] * len(turns)
+        cells += list(turns)
+    header += LATE.names
+    units += ["mm/s"] * 3
+    cells += list(1e3 * velocity)
+    return Table(stream.file, tuple(header), tuple(units), tuple(cells), stream.rows[rows])

@@ -9,20 +9,27 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.api.rendering import ChartedResult, Judged
 from calib.apps.monitoring import pages
 from calib.apps.monitoring.settings import DEFAULT_DRIFT, DriftSettings
 from calib.arguments import checked
-from calib.data.poses.fit_options import FitOptions, read_options
 from calib.errors import Finding, UsageError, require
-from calib.procedure.findings import Verdict, lines_of, settle
-from calib.procedure.kinematic_stage import inputs
-from calib.procedure.report.page import RecordColumn, Section, Text, table
-from calib.procedure.session.drift import Trend, noise_of_difference, repeats, trends
 from calib.records import plain
+from calib.result_kinds import BY_NAME
+from calib.toolkit.pose_data import FitOptions, read_fit_options
+from calib.toolkit.report_pages import RecordColumn, Section, Text, table
+from calib.toolkit.result_folders import (
+    ChartedResult,
+    Judged,
+    Verdict,
+    lines_of,
+    load_robot,
+    read_measured_file,
+    settle,
+)
+from calib.toolkit.sessions import Trend, noise_of_difference, repeats, trends
 
 if TYPE_CHECKING:
-    from calib.procedure.report.charts import Chart
+    from calib.toolkit.report_charts import Chart
 
 TABLE = "trends.csv"
 
@@ -41,6 +48,7 @@ class DriftFound(ChartedResult, Judged):
     trends: tuple[Trend, ...]
     noticed: tuple[Finding, ...]
 
+    kind = BY_NAME["drift"]
     tab = "trends noticed plot save"
 
     @property
@@ -65,8 +73,7 @@ class DriftFound(ChartedResult, Judged):
 
     def charts(self) -> dict[str, Chart]:
         """Return what the figures show: the motion of repeated poses' targets, with the slope."""
-        from calib.procedure.report.charts import Chart, Panel, line
-        from calib.procedure.report.style import AFTER, QUIET
+        from calib.toolkit.report_charts import AFTER, QUIET, Chart, Panel, line
 
         panels = []
         for trend in self.trends:
@@ -92,7 +99,13 @@ class DriftFound(ChartedResult, Judged):
             ["Targets of repeated poses less the arm's prediction."],
             (TABLE, header, rows),
         )
-        numbers: dict[str, object] = {"robot": self.robot, "verdict": self.verdict.level, "noticed": self.noticed}
+        verdict = self.verdict
+        numbers: dict[str, object] = {
+            "robot": self.robot,
+            "verdict": verdict.level,
+            "reason": verdict.reason,
+            "noticed": self.noticed,
+        }
         for trend in self.trends:
             numbers[trend.what] = {
                 "slope": trend.slope,
@@ -132,9 +145,11 @@ def drift(
     Raises:
         UsageError: where no pose was measured twice.
     """
-    chosen = options if isinstance(options, FitOptions) else read_options(None if options is None else Path(options))
-    chain = inputs.load_robot(robot, None, chosen, base=base, tip=tip)[0]
-    blocks = [block for path in measured for block in inputs.read_file(Path(path), chain, chosen)]
+    chosen = (
+        options if isinstance(options, FitOptions) else read_fit_options(None if options is None else Path(options))
+    )
+    chain = load_robot(robot, None, chosen, base=base, tip=tip)[0]
+    blocks = [block for path in measured for block in read_measured_file(Path(path), chain, chosen)]
     repeat_findings = repeats(chain, blocks[:1], blocks[1:], settings.sigma or 0.0)
     trends_found = tuple(trends(chain, blocks[:1], blocks[1:], settings.sigma or 0.0))
     message = "no pose was measured twice: measure the first poses again at the end, into the same or a further file"

@@ -9,21 +9,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.api.rendering import ChartedResult, Judged
 from calib.apps.monitoring import pages
 from calib.apps.monitoring.comparison.change_part import plus_minus
 from calib.apps.monitoring.comparison.change_test import ParameterChange
 from calib.apps.monitoring.comparison.geometry_change import GeometryChange
 from calib.apps.monitoring.comparison.robot_change import diff
 from calib.errors import SessionError, UsageError, command_line, require
-from calib.folders import METRICS
-from calib.procedure.report.page import RecordColumn, Section, table
-from calib.procedure.session.folder import Session, open_session
-from calib.procedure.session.results import folders_of, position_errors, torque_error
 from calib.records import plain
+from calib.result_kinds import BY_NAME
+from calib.toolkit.opened_results import Unjudged
+from calib.toolkit.report_pages import RecordColumn, Section, table
+from calib.toolkit.result_folders import ChartedResult, Judged
+from calib.toolkit.sessions import Session, folders_of, open_session, position_errors, torque_error
 
 if TYPE_CHECKING:
-    from calib.procedure.report.charts import Chart
+    from calib.toolkit.report_charts import Chart
 
 TABLE = "log.csv"
 HEADER = (
@@ -93,12 +93,13 @@ class LogLine:
 
 
 @dataclass(frozen=True, eq=False)
-class RobotLog(ChartedResult, Judged):
+class RobotLog(ChartedResult, Judged, Unjudged):
     """The calibrations of one robot, oldest first. ``print`` shows a line for each."""
 
     robot: str
     lines: tuple[LogLine, ...]
 
+    kind = BY_NAME["log"]
     tab = "robot lines plot save"
 
     def section(self) -> Section:
@@ -118,8 +119,7 @@ class RobotLog(ChartedResult, Judged):
 
     def charts(self) -> dict[str, Chart]:
         """Return what the figure shows: errors of each calibration, and the tool's motion since the one before."""
-        from calib.procedure.report.charts import Chart, Panel, line
-        from calib.procedure.report.style import AFTER, BEFORE
+        from calib.toolkit.report_charts import AFTER, BEFORE, Chart, Panel, line
 
         dates, panels = [log_line.date for log_line in self.lines], []
         values = {
@@ -168,13 +168,13 @@ def log(folders: Sequence[str | Path], *, mixed: bool = False) -> RobotLog:
         message = f"the sessions are of other {attribute} ({', '.join(names)}); --mixed takes them for one robot"
         require(len(names) < 2 or mixed, message, UsageError)
     for session in sessions:
-        finished = session.path("verdict.json").exists()
+        finished = session.concluded
         message = f"{session.folder} has no verdict yet: {command_line('next', session.folder)}"
         require(finished, message, SessionError)
     lines, last = list[LogLine](), None
     for session in sessions:
         change = None
-        if (session.fit.path / METRICS).exists() and session.geometric:
+        if session.fit.numbers.exists() and session.geometric:
             change = last and diff(last, session.folder).geometry
             last = session.folder
         lines.append(

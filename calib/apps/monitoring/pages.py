@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from calib import files, folders
-from calib.procedure.report.page import Pictures, Section
+from calib.toolkit.report_pages import Pictures, Section
 
 if TYPE_CHECKING:
-    from calib.procedure.report.charts import Chart
+    from calib.toolkit.report_charts import Chart
 
 PAGE, PICTURE = "report.html", "plot_{}.png"
 
@@ -45,9 +45,8 @@ def save(
 
 
 def _write(folder: Path, title: str, setup: Mapping[str, str], parts: Sequence[ResultPart], numbers: Any) -> None:
-    from calib.procedure.report.certificate.record import Entry, report
-    from calib.procedure.report.certificate.rendering import html
-    from calib.procedure.report.charts import picture
+    from calib.toolkit.report_charts import picture
+    from calib.toolkit.report_pages import Entry, as_html, report_page
 
     sections = list[Section]()
     for part in parts:
@@ -59,5 +58,5 @@ def _write(folder: Path, title: str, setup: Mapping[str, str], parts: Sequence[R
         name, header, rows = part.table
         files.write_table(folder / name, header, rows)
     entries = [Entry(*fields) for fields in setup.items()]
-    files.write(folder / PAGE, html(report(title, " to ".join(setup.values()), entries, sections)))
+    files.write(folder / PAGE, as_html(report_page(title, " to ".join(setup.values()), entries, sections)))
     files.write_json(folder / folders.METRICS, numbers)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from calib.arguments import checked
 from calib.config_types import Flag, Positive, Seed, Text
-from calib.procedure.kinematic_stage.settings import Tolerance
+from calib.toolkit.result_folders import Tolerance
 
 
 @checked

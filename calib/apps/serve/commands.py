@@ -29,7 +29,7 @@ def serve(folder: Path, host: str = LOCAL, port: Annotated[int, typer.Option(min
     import secrets
     import socket
 
-    from calib.procedure.session.folder import open_session
+    from calib.toolkit.sessions import open_session
 
     message = "calib serve needs starlette, uvicorn and python-multipart: pip install 'armature-calib[serve]'"
     with refused_as(UsageError, ImportError, message):

@@ -21,9 +21,21 @@ from calib.apps.serve.work import CHECK, NEXT, REDO, Work
 from calib.apps.viewer.viewer import FILE as RECORDING
 from calib.errors import CalibError, complaint
 from calib.folders import PAGES
-from calib.procedure.report.templates import filled
-from calib.procedure.session import commands, steps
-from calib.procedure.session.folder import BROUGHT, Session, open_session
+from calib.toolkit.report_pages import filled
+from calib.toolkit.sessions import (
+    BROUGHT,
+    DONE,
+    KEPT,
+    WAITING,
+    Session,
+    asks,
+    clear_staging,
+    find_step,
+    open_session,
+    read_state,
+    step_states,
+    steps_of,
+)
 
 HERE = "calib.apps.serve"
 DRIFT = "the first poses measured again at the end, to check for drift (optional)"
@@ -88,7 +100,7 @@ def application(work: Work, token: str = "", host: str = "127.0.0.1") -> Starlet
         token: that every request has to know; empty: none.
         host: by which it is reached, besides addresses in numbers and this computer's names.
     """
-    steps.clear_staging(open_session(work.folder))
+    clear_staging(open_session(work.folder))
     routes = [
         Route("/", page),
         Route("/page.js", script),
@@ -117,10 +129,10 @@ def page(request: Request) -> Response:
     """Return the page of the session as it stands."""
     work: Work = request.app.state.work
     session = open_session(work.folder)
-    states = steps.states(session)
-    ahead = next((state for state in states if state.kind not in (steps.DONE, steps.KEPT)), None)
-    waits = ahead if ahead is not None and ahead.kind == steps.WAITING else None
-    task, file = commands.asks(session, waits) if waits else ("", "")
+    states = step_states(session)
+    ahead = next((state for state in states if state.kind not in (DONE, KEPT)), None)
+    waits = ahead if ahead is not None and ahead.kind == WAITING else None
+    task, file = asks(session, waits) if waits else ("", "")
     pictures = [path for path in _files(session) if path.suffix in PICTURES]
     values = {
         "session": session,
@@ -142,12 +154,12 @@ def page(request: Request) -> Response:
 
 
 def _notes(session: Session) -> dict[str, tuple[str, ...]]:
-    return {name: record.notes for name, record in steps.read_state(session).steps.items()}
+    return {name: record.notes for name, record in read_state(session).steps.items()}
 
 
 def _kinds(session: Session) -> list[tuple[str, str, list[str]]]:
     """Return the kinds of files that the session takes: name, words, and those that were brought."""
-    labels = dict(step.brings for step in steps.steps_of(session))
+    labels = dict(step.brings for step in steps_of(session))
     if session.geometric:
         labels["drift"] = DRIFT
     kinds = []
@@ -197,7 +209,7 @@ def go_on(request: Request) -> Response:
     """Start a run of `calib next`, or `calib redo`; where one is under way already, none."""
     work, step = request.app.state.work, request.path_params.get("step", "")
     if step:
-        steps.find(open_session(work.folder), step)
+        find_step(open_session(work.folder), step)
     work.ask(REDO if step else NEXT, step)
     return RedirectResponse("/", 303)
 

@@ -10,9 +10,9 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import File
 
 from calib import files
-from calib.data.poses import IMAGES
 from calib.errors import UsageError, require
-from calib.procedure.session.folder import BROUGHT, LOGS, Session
+from calib.toolkit.pose_data import IMAGES
+from calib.toolkit.sessions import BROUGHT, LOGS, Session
 
 BAG = "metadata.yaml"  # of a ROS bag, which is a folder
 

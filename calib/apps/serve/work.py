@@ -18,7 +18,7 @@ from typing import Any
 
 from calib import bug_reports
 from calib.errors import command_line, complaint
-from calib.procedure.session.folder import POSES, UNSEEN, Session, open_session
+from calib.toolkit.sessions import POSES, UNSEEN, Session, open_session
 from calib.workers.processes import end_with_parent
 
 CHECK, NEXT, REDO = "check", "next", "redo"
@@ -125,7 +125,7 @@ class Work:
 
 def _run(telling: Connection, folder: Path, task: str, subject: str) -> None:
     """Do a job in its own process, and send what there is to say."""
-    from calib.procedure.session.commands import go_on
+    from calib.toolkit.sessions import go_on
 
     def tell(kind: str) -> Callable[[object], None]:
         return lambda text: telling.send((kind, str(text)))
@@ -151,16 +151,16 @@ def checked(session: Session, kind: str) -> list[str]:
     Raises:
         CalibError: for what the step would refuse.
     """
-    from calib.procedure.session import dynamics_steps, geometry_steps
+    from calib.toolkit.sessions import chain_of, check_recording, notes_on, read_measured
 
     paths = session.brought(kind)
     if kind in ("training", "unseen"):
         if not session.fit.robot.exists():
             return ["the logs are checked once the geometry is fitted"]
         motion = "training" if kind == "training" else "validation"
-        return [note for path in paths for note in dynamics_steps.check_recording(session, path, motion)[1]]
-    chain = geometry_steps.chain_of(session)
-    blocks = geometry_steps.read_measured(session, chain, paths)
+        return [note for path in paths for note in check_recording(session, path, motion)[1]]
+    chain = chain_of(session)
+    blocks = read_measured(session, chain, paths)
     if kind == "drift":
         return [f"{name}: {len(block)} rows" for name, block in blocks]
-    return geometry_steps.notes_on(session, chain, blocks, POSES if kind == "measured" else UNSEEN)
+    return notes_on(session, chain, blocks, POSES if kind == "measured" else UNSEEN)

@@ -11,7 +11,7 @@ from calib.cli.shared import Seed, command, exit_failed, reporting, say
 from calib.errors import UsageError, one_of, require
 
 if TYPE_CHECKING:
-    from calib.procedure.report.page import Block
+    from calib.toolkit.report_pages import Block
 
 # Between two lines on progress where the output is no terminal [s].
 LOG_INTERVAL = 30.0
@@ -51,8 +51,8 @@ def study(
     """
     from calib.apps.fleet import stores
     from calib.apps.studies import report
-    from calib.identification.registry import METHODS
-    from calib.procedure.report import page
+    from calib.toolkit.report_pages import rendered
+    from calib.toolkit.torque_models import METHODS
 
     if list_methods:
         say(*METHODS.values())
@@ -88,7 +88,7 @@ def study(
     else:
         for condition in conditions:
             blocks += [report.condition_table(condition), *report.failures(condition)]
-    say(*page.rendered(blocks), result=True)
+    say(*rendered(blocks), result=True)
     say(*outcome.described(), f"written to {location}: {report.REPORT} shows it")
 
 
@@ -123,9 +123,8 @@ def compare(
     from calib import files
     from calib.apps.studies import method_comparison
     from calib.apps.studies.method_comparison import caveats, compare_methods, write_table
-    from calib.identification.identify_options import read_options
-    from calib.procedure.dynamic_stage import inputs
-    from calib.procedure.report import page
+    from calib.toolkit.model_identification import gather_recordings, read_identify_options
+    from calib.toolkit.report_pages import printed_section
 
     if out is None:
         table = []
@@ -134,11 +133,11 @@ def compare(
     files.check_results(table, [robot, *recordings, *(validate or []), options], overwrite)
     names = _names(methods)
     with reporting() as (say_line, progress):
-        gathered = inputs.gather(
+        gathered = gather_recordings(
             robot,
             recordings,
             validate or (),
-            options=read_options(options),
+            options=read_identify_options(options),
             base=base,
             tip=tip,
             seed=seed,
@@ -149,7 +148,7 @@ def compare(
             gathered, names, friction, progress, lambda method: say_line(method_comparison.line(method))
         )
     section = method_comparison.section(compared, caveats(gathered, compared))
-    say(*page.section(section), result=True)
+    say(*printed_section(section), result=True)
     if out is not None:
         with files.results(table, overwrite=overwrite):
             say(f"written to {write_table(compared, out)}")
@@ -161,7 +160,7 @@ def compare(
 
 def _names(text: str | None) -> list[str] | None:
     """Return the methods of a comma-separated list after a check of their names; None for all."""
-    from calib.identification.registry import METHODS
+    from calib.toolkit.torque_models import METHODS
 
     if text is None:
         return None

@@ -52,7 +52,7 @@ from annotated_types import MinLen
 from calib.config import parse, read_toml, strict
 from calib.config_types import Name, OneOf, Real, Spread, Text, Whole
 from calib.errors import UsageError, require, suggestion
-from calib.identification.registry import METHODS, method_named
+from calib.toolkit.torque_models import METHODS, method_named
 
 ROBOTS = ("tx40", "rv2sq")
 MOTIONS = ("random", "designed")
@@ -229,10 +229,10 @@ def _check_cutoffs(conditions: Sequence[Condition]) -> None:
     Raises:
         UsageError: for a cut-off that the robot's log is sampled too slowly for.
     """
-    from calib.simulation import known_robots  # slow to load
+    from calib.toolkit.simulations import known_truth  # slow to load
 
     for condition in conditions:
-        rate = condition.rate or float(known_robots.truth(condition.robot)["control"]["sampling"])
+        rate = condition.rate or float(known_truth(condition.robot)["control"]["sampling"])
         limit = 0.5 * rate
         if condition.cutoff >= limit:
             raise UsageError(

@@ -16,31 +16,45 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from calib.apps.studies.conditions import LIBRARY, Condition
-from calib.data.recordings.recording import Recording
-from calib.data.signals.bandwidth import USABLE
-from calib.data.signals.filtering import design_decimator
-from calib.data.signals.motion import FilterOptions, make_motion
-from calib.dynamics import base as bases
-from calib.dynamics import drives
-from calib.dynamics.base import Base
-from calib.dynamics.bodies import bodies_of, with_payload
-from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.pseudo_inertia import ball, margin
-from calib.geometry import fit as geometry
-from calib.geometry.first_guess import install
-from calib.identification.closed_loop.controllers import Reference
-from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun, feed_forward, simulate
-from calib.identification.loop import LoopController, LoopSettings
-from calib.identification.methods.constraint_settings import ConstraintSettings
-from calib.identification.methods.method import IdentificationProblem
-from calib.identification.rows import Case, make_case, observe
-from calib.procedure.excitation import coefficients
-from calib.robot.chain import Chain, random_joints
-from calib.robot.library import load
-from calib.simulation import known_robots
-from calib.simulation.cell import SimulatedInstrument, measure
-from calib.simulation.known_robots import random_fourier
-from calib.simulation.virtual_cells import perturbed_cell, rigid
+from calib.toolkit.chains import Chain, load, random_joints
+from calib.toolkit.installations import fit_installation, install
+from calib.toolkit.planned_motions import read_trajectory
+from calib.toolkit.recordings import USABLE, FilterOptions, Recording, design_decimator, make_motion
+from calib.toolkit.simulations import (
+    LoopController,
+    LoopSettings,
+    Plant,
+    Reference,
+    Sensing,
+    SimulatedInstrument,
+    SimulatedRun,
+    feed_forward,
+    known_plant,
+    known_truth,
+    measure,
+    perturbed_cell,
+    plant_model,
+    published_controller,
+    random_fourier,
+    rigid,
+    simulate,
+)
+from calib.toolkit.torque_models import (
+    Base,
+    Case,
+    ConstraintSettings,
+    IdentificationModel,
+    IdentificationProblem,
+    ball,
+    bodies_of,
+    drive_term,
+    find_base,
+    make_case,
+    margin,
+    observe,
+    regroup,
+    with_payload,
+)
 
 # The numbers below are our choices.
 # Random motions to take the best of; harmonics of each.
@@ -116,8 +130,8 @@ def set_up(condition: Condition) -> Setup:
 def _set_up(robot: str, duration: float, motion: str) -> Setup:
     """Return the shared data of a robot and a motion, logged at the robot's own rate."""
     chain = load(robot)
-    plant = known_robots.plant(robot)
-    control = known_robots.truth(robot)["control"]
+    plant = known_plant(robot)
+    control = known_truth(robot)["control"]
     rate = float(control["rate"])
     every = rate / float(control["sampling"])
     validation = _drawn(chain, duration, rate, VALIDATION)
@@ -128,7 +142,7 @@ def _set_up(robot: str, duration: float, motion: str) -> Setup:
             folder = LIBRARY / robot
         else:
             folder = Path(motion)
-        series = coefficients.read(folder)
+        series = read_trajectory(folder)
         t = np.arange(round(duration * rate) + 1) / rate
         training = Reference(t, *series.orders(t))
     return Setup(chain, plant, training, validation, every)
@@ -136,7 +150,7 @@ def _set_up(robot: str, duration: float, motion: str) -> Setup:
 
 def _best_random_motion(robot: str, chain: Chain, duration: float, rate: float) -> Reference:
     """Return the best of `MOTION_TRIES` random motions by the condition number of the base regressor."""
-    model = known_robots.model(known_robots.plant(robot))
+    model = plant_model(known_plant(robot))
     base_columns = _nominal_base(robot).kept
     part = slice(None, None, 2 * THIN)
 
@@ -168,7 +182,7 @@ def _drawn(chain: Chain, duration: float, rate: float, number: int) -> Reference
 
 @lru_cache(maxsize=4)
 def _nominal_base(robot: str) -> Base:
-    return bases.find(known_robots.model(known_robots.plant(robot)))
+    return find_base(plant_model(known_plant(robot)))
 
 
 @lru_cache(maxsize=2)
@@ -193,7 +207,7 @@ def make_experiment(condition: Condition, seed: int) -> Experiment:
 def data_set(condition: Condition, seed: int) -> Experiment:
     """Return the simulated data set of a condition and a seed, without start values; always the same."""
     setup = set_up(condition)
-    controller = known_robots.controller(condition.robot)
+    controller = published_controller(condition.robot)
     robots = _robots(condition, setup, seed)
     model, base = robots.model, robots.base
     case = _recorded(condition, setup, robots.true, controller, seed)
@@ -244,7 +258,7 @@ class _Robots:
 def _robots(condition: Condition, setup: Setup, seed: int) -> _Robots:
     """Return the true robot, the assumed model with its base, and the robot with the model's parameters."""
     plant, chain = setup.plant, setup.chain
-    robots = _Robots(plant, known_robots.model(plant), _nominal_base(condition.robot), plant)
+    robots = _Robots(plant, plant_model(plant), _nominal_base(condition.robot), plant)
     if condition.mismatch in ("geometry", "calibrated"):
         cell = rigid(perturbed_cell(chain, seed, SimulatedInstrument(), size=DRAWING_ERROR))
         true_chain = replace(cell.truth.chain, inertias=chain.inertias)
@@ -252,13 +266,13 @@ def _robots(condition: Condition, setup: Setup, seed: int) -> _Robots:
         if condition.mismatch == "geometry":
             return robots
         measured = [measure(cell, random_joints(chain, POSE_COUNT, seed), seed=seed)]
-        fitted_chain = geometry.fit(install(chain, measured), measured).cell.chain
+        fitted_chain = fit_installation(install(chain, measured), measured).cell.chain
         fitted_model = replace(robots.model, bodies=bodies_of(fitted_chain))
-        return replace(robots, model=fitted_model, base=bases.regroup(robots.base, fitted_model))
+        return replace(robots, model=fitted_model, base=regroup(robots.base, fitted_model))
     if condition.mismatch == "friction":
-        friction = known_robots.truth(condition.robot)["drives"]
+        friction = known_truth(condition.robot)["drives"]
         v0 = float(friction["v0"])
-        peaks = [drives.term(f"Fs{joint + 1}", "stribeck", joint, SLIP, 1.0, v0) for joint in range(chain.n)]
+        peaks = [drive_term(f"Fs{joint + 1}", "stribeck", joint, SLIP, 1.0, v0) for joint in range(chain.n)]
         values = np.concatenate([plant.parameters, STRIBECK * np.array(friction["Fc"])])
         return replace(robots, true=Plant(plant.bodies, (*plant.terms, *peaks), values))
     if condition.mismatch == "payload":
@@ -297,7 +311,7 @@ def _recorded(condition: Condition, setup: Setup, true: Plant, controller: LoopC
 def _loop(condition: Condition, controller: LoopController) -> LoopSettings:
     """Return the loop settings for the methods, with the errors of the condition."""
     kp, kd = BELIEVED if condition.mismatch == "controller" else (1.0, 1.0)
-    truth = known_robots.truth(condition.robot)
+    truth = known_truth(condition.robot)
     believed_kp = tuple(kp * controller.kp)
     believed_kd = tuple(kd * controller.kd)
     limit = tuple(controller.limit)

@@ -20,17 +20,18 @@ import numpy as np
 
 from calib import files
 from calib.errors import CalibError, UsageError, require
-from calib.identification.identify import Identification, identify
-from calib.identification.methods.method import Method
-from calib.identification.prediction import predict
-from calib.identification.registry import METHODS, method_named
-from calib.identification.rows import Case
-from calib.identification.settings import IdentificationSettings
-from calib.procedure.dynamic_stage.identify import judged, overlaps, repeated_motion
-from calib.procedure.dynamic_stage.inputs import IdentificationInputs
-from calib.procedure.dynamic_stage.verdict import motion_findings
-from calib.procedure.findings import Verdict, lines_of
-from calib.procedure.report.page import Block, RecordColumn, Section, Text, table
+from calib.toolkit.model_identification import (
+    Identification,
+    IdentificationInputs,
+    identify,
+    judged,
+    motion_findings,
+    overlaps,
+    repeated_motion,
+)
+from calib.toolkit.report_pages import Block, RecordColumn, Section, Text, table
+from calib.toolkit.result_folders import Verdict, lines_of
+from calib.toolkit.torque_models import METHODS, Case, IdentificationSettings, Method, method_named, predict
 
 # Of the rule above (our choices).
 MAX_SIGMAS, MAX_SHARE, MAX_TIMES, FAST_SECONDS = 2.0, 0.05, 2.0, 1.0

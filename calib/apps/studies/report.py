@@ -33,9 +33,8 @@ from calib.apps.studies.summary import (
 )
 from calib.apps.studies.trial import TrialRow
 from calib.errors import UsageError, require
-from calib.procedure.report.charts import Chart, Layer, Panel, box, line, picture, text
-from calib.procedure.report.page import Block, Picture, Pictures, RecordColumn, ReportTable, Section, Text, table
-from calib.procedure.report.style import AFTER, BEFORE, MARK
+from calib.toolkit.report_charts import AFTER, BEFORE, MARK, Chart, Layer, Panel, box, line, picture, text
+from calib.toolkit.report_pages import Block, Picture, Pictures, RecordColumn, ReportTable, Section, Text, table
 from calib.workers import workers
 
 # Height of one method in a box plot [in].
@@ -286,7 +285,7 @@ def make_page(
         rows: of these conditions.
         plots: with box plots.
     """
-    from calib.procedure.report.templates import filled, issued
+    from calib.toolkit.report_pages import filled, issued
 
     blocks: list[Block] = [overview(conditions)]
     if len(conditions) > 1:

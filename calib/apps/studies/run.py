@@ -11,7 +11,7 @@ from calib.apps.studies.conditions import Study
 from calib.apps.studies.store import RowStore
 from calib.apps.studies.trial import Trials, grouped, run_trials
 from calib.errors import TaskLost
-from calib.identification.registry import method_named
+from calib.toolkit.torque_models import method_named
 from calib.workers import Workers
 
 # Shortest time between two messages on progress [s].

@@ -11,11 +11,8 @@ import numpy as np
 from calib.apps.studies.conditions import Condition
 from calib.apps.studies.experiment import Experiment, make_experiment, set_up
 from calib.errors import CalibError
-from calib.identification.closed_loop.simulation import Plant, Sensing, simulate
-from calib.identification.methods.method import EstimateStatus, MethodEstimate
-from calib.identification.prediction import Dynamics, predict
-from calib.identification.registry import VERSIONS, method_named
-from calib.simulation import known_robots
+from calib.toolkit.simulations import Plant, Sensing, published_controller, simulate
+from calib.toolkit.torque_models import VERSIONS, Dynamics, EstimateStatus, MethodEstimate, method_named, predict
 
 FOUND = EstimateStatus.FOUND.value
 # Beside `EstimateStatus`: the true robot, or the method, raised an error.
@@ -200,7 +197,7 @@ def _resimulated(condition: Condition, data: Experiment, values: np.ndarray, see
         return NAN
     setup, problem, model = set_up(condition), data.problem, data.model
     plant = Plant(model.bodies, model.terms, problem.base.to_standard(values))
-    controller, sensing = known_robots.controller(condition.robot), Sensing(every=setup.every)
+    controller, sensing = published_controller(condition.robot), Sensing(every=setup.every)
     try:
         run = simulate(plant, controller, setup.reference, sensing)
     except CalibError:

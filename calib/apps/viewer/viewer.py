@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.apps.viewer import scene as viewing
-from calib.apps.viewer.scene import Drawn, ErrorSizes, Measured, Played, Scene, Torques
 from calib.errors import CalibError, UsageError, command_line, refused_as
-from calib.robot.chain import Chain
-from calib.robot.kinematics import joint_frames
+from calib.toolkit.chains import Chain, joint_frames
+from calib.toolkit.opened_results import DrawnRobot as Drawn
+from calib.toolkit.opened_results import ErrorSizes, Measured, Played, Scene, Torques, drawn, strips, thinned
 from calib.transforms import to_quaternion
 
 ARM, BEFORE, AFTER, SEEN, LIMIT = ([90, 100, 115], [213, 94, 0], [0, 130, 90], [40, 90, 180], [200, 60, 60])
@@ -47,7 +46,7 @@ def write(folder: str | Path, path: str | Path, robot: str | None = None) -> Sce
         UsageError: where rerun is not installed, or there is nothing to see.
     """
     path = Path(path)
-    scene = viewing.read(folder, robot)
+    scene = drawn(folder, robot)
     with tempfile.TemporaryDirectory() as temporary_folder:
         temporary = Path(temporary_folder) / "scene.rrd"
         recording = rr.RecordingStream(files.MAKER, recording_id=scene.title)
@@ -80,7 +79,7 @@ def spawn(folder: str | Path, robot: str | None = None) -> Scene:
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         saved = command_line("view", folder, "--save", FILE)
         raise UsageError(f"no display to open a window on; {saved} writes a file for rerun on another computer")
-    scene = viewing.read(folder, robot)
+    scene = drawn(folder, robot)
     recording = rr.RecordingStream(files.MAKER, recording_id=scene.title)
     with refused_as(
         CalibError, Exception, "Rerun's window did not open ({}); calib view --save FILE.rrd writes a file"
@@ -215,7 +214,7 @@ def _sizes(recording: Any, scene: Scene, sizes: ErrorSizes, start: float) -> flo
 
 def _chosen(recording: Any, scene: Scene, chain: Chain | Drawn, name: str, q: np.ndarray, start: float) -> float:
     """Log a pose plan as it grows: one more tool position each step, and the arm at the newest pose."""
-    tips = viewing.strips(chain, q)[0][:, -1]
+    tips = strips(chain, q)[0][:, -1]
     counts = np.arange(1, len(q) + 1)
     grown = np.concatenate([tips[:k] for k in counts])
     columns = rr.Points3D.columns(positions=grown, radii=np.full(len(grown), 0.008)).partition(counts)
@@ -229,7 +228,7 @@ def _chosen(recording: Any, scene: Scene, chain: Chain | Drawn, name: str, q: np
 def _played(recording: Any, scene: Scene, played: Played, start: float) -> float:
     """Log a motion with its limits from `start` on [s], and return the start time of the next part."""
     t = start + played.t - played.t[0]
-    samples = viewing.thinned(played.t)
+    samples = thinned(played.t)
     index = [rr.TimeColumn("time", duration=t[samples])]
     names = scene.chain.joint_names if scene.chain is not None else [f"q{k + 1}" for k in range(played.q.shape[1])]
     ends = [rr.TimeColumn("time", duration=t[[0, -1]])]
@@ -261,7 +260,7 @@ def _torques(recording: Any, scene: Scene, torques: Torques, start: float) -> fl
         _series(recording, f"torques/{_part(name)}/predicted", index, predicted, f"predicted [{unit}]", AFTER)
         _series(recording, f"residuals/{_part(name)}", index, measured - predicted, f"{name} [{unit}]")
     if torques.q is not None:
-        samples = viewing.thinned(torques.t)
+        samples = thinned(torques.t)
         _arm(recording, scene, [rr.TimeColumn("time", duration=t[samples])], torques.q[samples])
     return float(t[-1]) + GAP
 
@@ -283,15 +282,15 @@ def _arm(recording: Any, scene: Scene, index: list[Any], q: np.ndarray) -> None:
     """Log the arm's links as lines, and its links' frames where it has meshes."""
     if scene.chain is None or q.shape[1] != scene.chain.n:
         return
-    lines = viewing.strips(scene.chain, q)
+    lines = strips(scene.chain, q)
     thick = 0.006 if scene.meshes else 0.018 / len(lines)
     count = len(q) * len(lines)
-    strips = rr.LineStrips3D.columns(
+    line_strips = rr.LineStrips3D.columns(
         strips=[line for at_once in zip(*lines) for line in at_once],
         radii=np.full(count, thick),
         colors=np.tile(ARM, (count, 1)),
     )
-    recording.send_columns("world/robot/lines", indexes=index, columns=strips.partition([len(lines)] * len(q)))
+    recording.send_columns("world/robot/lines", indexes=index, columns=line_strips.partition([len(lines)] * len(q)))
     points = np.concatenate(lines, axis=1)
     count = points.shape[1]
     spheres = rr.Points3D.columns(

@@ -16,7 +16,7 @@ TOML; every key is optional, and an unknown key is refused. Lengths in m, angles
     planned = "poses.csv"            # of a file without joints: the poses driven, in this order or found by geometry
     socket_distance = 0.05           # between two sockets of the same fixture position
     socket_pairs = [["0", "1"]]      # which sockets that joins, where there are more than two
-    model = "auto"                   # or frames, offsets, geometry, stiffness, bending, coupling, harmonics, wobble
+    model = "auto"                   # or the largest model of the ladder to fit; all names: below
     loss = "auto"                    # auto (cauchy where rows are grossly wrong), none, huber, cauchy
     loss_scale = 1.345               # its constant, in sigmas
     beta = true                      # a sixth element for nearly parallel axes of an MDH table

@@ -1,6 +1,6 @@
 """Model selection: which joint corrections are added to the geometry, judged on rows that were not fitted.
 
-    geometry → + stiffness → + bending → + coupling → + harmonics → + wobble
+    geometry → + one effect → + one more … (their names: `calib.data.poses.MODELS`)
 
 The rigid geometry is not selected: it is the most probable one under priors of making (`calib.geometry.fit`), or the
 frames or joint offsets alone where the user asks for these. Of the effects on top of it, the one that lowers the error

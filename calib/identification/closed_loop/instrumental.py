@@ -240,14 +240,8 @@ def identify_instrumental(
             "instruments from simulation need a recording with its reference, and rows motor, link or both (of a "
             f"parallel robot motor or platform); found '{rows.name}'"
         )
-    observed = [replace(observe(model, base.kept, case, decimator), names=base.names) for case, _ in cases]
+    observed, friction = _observed_with_friction(model, base, cases, decimator, terms)
     data = pool(triangulate(observed), model.rows)
-    friction = _Friction((), model, decimator, None)
-    if terms:
-        loads = base.to_standard(wls(data, settled_std(data, 1e-3)).estimate.values)
-        friction = _Friction(tuple(terms), model, decimator, loads)
-        observed = [friction.added(part, case) for part, (case, _) in zip(observed, cases)]
-        data = pool(triangulate(observed), model.rows)
     if constraints is None and positive:
         settings = ConstraintSettings(signs=False, inertia=0, bounds=dict.fromkeys(positive, (0.0, np.inf)))
         constraints = make_constraints(settings, model, base, base.names, [None] * base.b)
@@ -286,16 +280,36 @@ def identify_instrumental(
         before = estimate.fit
         std = estimate.fit.group_std
         tau = estimate.tau
-        if round_count >= limit:
-            break
-    kind = NotConverged
-    if len(rounds) > 2 and rounds[-1].change > rounds[1].change:
-        kind = Diverged
-    raise kind(
-        f"instruments from simulation: parameters still change by {100 * rounds[-1].change:.3g} % after {limit} "
-        f"iterations; estimate fewer (essential ones), or check the controller's gains{_if_weak(task, estimate, std)}",
-        before,
+    change_percent = 100 * rounds[-1].change
+    message = (
+        f"instruments from simulation: parameters still change by {change_percent:.3g} % after {limit} "
+        f"iterations; estimate fewer (essential ones), or check the controller's gains{_if_weak(task, estimate, std)}"
     )
+    if len(rounds) > 2 and rounds[-1].change > rounds[1].change:
+        raise Diverged(message, before)
+    raise NotConverged(message, before)
+
+
+def _observed_with_friction(
+    model: IdentificationModel,
+    base: Base,
+    cases: Sequence[tuple[Case, Loop]],
+    decimator: Decimator,
+    terms: Sequence[DriveTerm],
+) -> tuple[list[ObservationRows], _Friction]:
+    """Return the rows of all cases, and their richer friction, whose loads are those by least squares without it."""
+    observed = []
+    for case, _ in cases:
+        rows = observe(model, base.kept, case, decimator)
+        observed.append(replace(rows, names=base.names))
+    if not terms:
+        return observed, _Friction((), model, decimator, None)
+    data = pool(triangulate(observed), model.rows)
+    ordinary = wls(data, settled_std(data, 1e-3))
+    loads = base.to_standard(ordinary.estimate.values)
+    friction = _Friction(tuple(terms), model, decimator, loads)
+    richer = [friction.added(part, case) for part, (case, _) in zip(observed, cases)]
+    return richer, friction
 
 
 @dataclass(frozen=True, eq=False)

@@ -167,10 +167,10 @@ def settled(before: LinearFit, after: LinearFit, change: float = 0.025, residual
     usually 1 … 5 %). A parameter that moves by less than a fifth of its standard deviation rests as well (our choice:
     one near zero never meets a relative rule).
     """
-    change_ = np.abs(after.estimate.values - before.estimate.values)
+    parameter_change = np.abs(after.estimate.values - before.estimate.values)
     allowed = np.maximum(change * np.abs(before.estimate.values), 0.2 * after.estimate.sigma)
     sizes = before.estimate.residual_std, after.estimate.residual_std
-    return bool(np.all(change_ <= allowed) and abs(sizes[1] - sizes[0]) <= residual * sizes[0])
+    return bool(np.all(parameter_change <= allowed) and abs(sizes[1] - sizes[0]) <= residual * sizes[0])
 
 
 def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentStrength:

@@ -113,8 +113,8 @@ class _Simulated(Method):
                 constraints=constraints,
             )
             simulations = 0
-            for round_ in identification.rounds:
-                simulations += len(loops.pairs) * (1 + round_.retreats)
+            for iteration in identification.rounds:
+                simulations += len(loops.pairs) * (1 + iteration.retreats)
             result = replace(
                 plain,
                 method=self.name,

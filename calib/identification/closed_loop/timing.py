@@ -181,13 +181,13 @@ def motor_torques(case: Case) -> np.ndarray | None:
     return None
 
 
-def check_no_copy(motion: Motion, reference_: np.ndarray) -> None:
+def check_no_copy(motion: Motion, reference_q: np.ndarray) -> None:
     """Refuse a reference that is the measured motion itself, perhaps shifted in time, rounded or low-passed.
 
     Where the motion has died away the positions hold noise alone: a reference that holds it, too, comes from them.
 
     Args:
-        asked: the reference (N, n), filtered like the measured positions.
+        reference_q: the reference (N, n), filtered like the measured positions.
 
     Raises:
         MeasurementError: naming the shift.
@@ -200,7 +200,7 @@ def check_no_copy(motion: Motion, reference_: np.ndarray) -> None:
     if len(rows) < 10 or not moves.any():
         return
     measured = CubicSpline(t, motion.q[:, moves])
-    reference = CubicSpline(t, reference_[:, moves])
+    reference = CubicSpline(t, reference_q[:, moves])
     shift = _by_positions(reference, measured, rows)
     residual = measured(rows) - reference(np.clip(rows - shift, t[0], t[-1]))
     # of the positions' noise in the band; no commanded motion has that of the encoders

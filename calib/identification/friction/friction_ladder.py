@@ -1,6 +1,6 @@
 """Forward selection of friction terms, step by step and joint by joint, by the errors on held-out time.
 
-    standard → + coupling → + load → + presliding (→ + cable) → + stribeck → + asymmetric → + root → + cubic → + ripple
+    standard → + coupling → + the steps of `calib.dynamics.shapes.STEPS` in their order → + ripple
 
 Every step is tried on top of those taken: all joints get its terms, every time block is predicted by a fit to the
 others, and the terms stay at the joints whose error on unseen time falls by `MIN_GAIN`, and does not grow where one

@@ -174,15 +174,15 @@ def make_constraints(
     """
     requests: list[tuple[str, Mapping[str, float], float, float]]
     requests = [(name, {name: 1.0}, *bounds) for name, bounds in settings.bounds.items()]
-    for number, sum_ in enumerate(settings.sum, 1):
+    for number, weighted_sum in enumerate(settings.sum, 1):
         location = f"[[constraints.sum]] number {number}"
-        low, high = sum_.limits
-        label = sum_.name or " + ".join(f"{weight:g} {name}" for name, weight in sum_.weights.items())
-        twice = sum_.equal is not None and (sum_.least, sum_.most) != (None, None)
+        low, high = weighted_sum.limits
+        label = weighted_sum.name or " + ".join(f"{weight:g} {name}" for name, weight in weighted_sum.weights.items())
+        twice = weighted_sum.equal is not None and (weighted_sum.least, weighted_sum.most) != (None, None)
         require(not twice, f"{location}: 'equal' excludes 'least' and 'most'", UsageError)
         if low > high or not (np.isfinite(low) or np.isfinite(high)):
             refuse_option(f"{location} ({label})", "expected equal, or least <= most")
-        requests.append((label, sum_.weights, low, high))
+        requests.append((label, weighted_sum.weights, low, high))
     if settings.signs:
         for name, term in zip(names, terms):
             if term is not None and term.nonnegative and name not in settings.bounds:
@@ -338,10 +338,10 @@ def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.n
             message = f"'{name}' is not a parameter of this model{similar}; its parameters: {', '.join(names)}"
             refuse_option("[constraints]", message)
     # T of the kept columns is the identity
-    row_ = standard[base.kept]
-    if np.abs(base.transform.T @ row_ - standard).max() > 1e-6 * max(np.abs(standard).max(), 1e-300):
+    base_row = standard[base.kept]
+    if np.abs(base.transform.T @ base_row - standard).max() > 1e-6 * max(np.abs(standard).max(), 1e-300):
         refuse_option("[constraints]", _without_effect(weights, base))
-    row[: base.b] += row_
+    row[: base.b] += base_row
     require(row.any(), f"[constraints]: the weights of {', '.join(weights)} sum to zero", UsageError)
     return row
 

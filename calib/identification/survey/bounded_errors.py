@@ -154,9 +154,9 @@ def intervals(rows: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarra
             program = linprog(goals[k], system, limit, bounds=bounds, method="highs-ds")
             optima[k] = program.x
         violated = np.abs(q @ optima[ahead].T - ends[:, None])
-        open_ = violated.max(axis=0) > 1.0 + max_violation
-        active = np.union1d(active, np.argmax(violated[:, open_], axis=0))
-        ahead = ahead[open_]
+        violating = violated.max(axis=0) > 1.0 + max_violation
+        active = np.union1d(active, np.argmax(violated[:, violating], axis=0))
+        ahead = ahead[violating]
         rounds = rounds + 1
     best = np.einsum("kp,kp->k", np.tile(np.linalg.inv(upper), (2, 1)), optima)
     return best[:p], best[p:], rounds

@@ -68,9 +68,9 @@ class _MaximumLikelihood(Method):
         tolerance = 0.01
         for count in range(1, max_steps + 1):
             noise = _torque_noise(task, values, noise, (min_noise * std) ** 2)
-            round_ = _step(task, values, noise)
-            steps.append(float(np.max(np.abs(round_.values - values) / round_.sigma)))
-            values = round_.values
+            iteration = _step(task, values, noise)
+            steps.append(float(np.max(np.abs(iteration.values - values) / iteration.sigma)))
+            values = iteration.values
             if not np.all(np.isfinite(values)) or (count > 5 and steps[-1] > 10.0 * steps[0]):
                 raise Diverged("maximum likelihood diverged: too much position noise for a linear model", values)
             if steps[-1] < tolerance:
@@ -83,7 +83,7 @@ class _MaximumLikelihood(Method):
         return MethodEstimate(
             self.name,
             EstimateStatus.FOUND,
-            _packed(problem, round_, noise),
+            _packed(problem, iteration, noise),
             problem.pooled,
             np.sqrt(noise),
             residual_inflation(problem.rows, values),
@@ -284,15 +284,15 @@ def changed(task: NoisyStates, part: _Recording, error: np.ndarray) -> np.ndarra
     return out
 
 
-def _packed(problem: IdentificationProblem, round_: _Round, noise: np.ndarray) -> LinearFit:
+def _packed(problem: IdentificationProblem, iteration: _Round, noise: np.ndarray) -> LinearFit:
     """Return the fit of the last round; its covariance allows for residuals correlated in time."""
     plain = wls(problem.pooled, np.sqrt(noise))
-    p = len(round_.values)
+    p = len(iteration.values)
     rows = int(problem.pooled.rows.sum())
-    meat = sum(scatter(white, residual) for white, residual in zip(round_.white, round_.residual))
-    covariance = rows / (rows - p) * round_.bread @ meat @ round_.bread.T
-    estimate = replace(plain.estimate, values=round_.values, covariance=covariance, residual_std=1.0)
-    return LinearFit(estimate, np.sqrt(noise), *condition_numbers(np.concatenate(round_.white).reshape(-1, p)))
+    meat = sum(scatter(white, residual) for white, residual in zip(iteration.white, iteration.residual))
+    covariance = rows / (rows - p) * iteration.bread @ meat @ iteration.bread.T
+    estimate = replace(plain.estimate, values=iteration.values, covariance=covariance, residual_std=1.0)
+    return LinearFit(estimate, np.sqrt(noise), *condition_numbers(np.concatenate(iteration.white).reshape(-1, p)))
 
 
 ML = _MaximumLikelihood(

@@ -142,7 +142,7 @@ def cut(rows: ObservationRows, part: slice) -> ObservationRows:
         block=rows.block[part],
         standing=rows.standing[part],
         swing=rows.swing[part],
-        slowness=rows.slowness[part],
+        breakaway=rows.breakaway[part],
     )
 
 

@@ -222,12 +222,7 @@ def plan(
         UsageError: for waypoints that cannot be reached, and limits that cannot be kept.
     """
     show = progress or _silent
-    if settings.shorten and settings.lines:
-        raise UsageError(
-            "--shorten cannot be combined with --line: straight lines leave no path to change; leave one out"
-        )
-    if settings.payloads and model is None:
-        raise UsageError(f"payloads {', '.join(settings.payloads)}: need an identified model; name it (--model)")
+    _check_request(settings, model)
     waypoint_file = waypoints if isinstance(waypoints, Path) else None
     calibrated, source = load_rigid(robot, waypoint_file, base, tip)
     chain = calibrated.chain
@@ -247,16 +242,7 @@ def plan(
         check_within(path, lower, upper, points)
     shaped = None
     if settings.shorten:
-
-        def duration(path: JointPath) -> float:
-            check_within(path, lower, upper)
-            _check_constraints(path, motion_limits)
-            return time_optimal(path, timing_limits, dynamics, grid=COARSE_GRID).duration
-
-        def report(timing_count: int, best: float) -> None:
-            show(f"shaping the path: {best:.4f} s after {timing_count} timings")
-
-        shaped = shorten(points, duration, settings.shorten, settings.stray, report)
+        shaped = _shortened(points, settings, motion_limits, timing_limits, dynamics, show)
         paths = [shaped.path]
     margins = np.min([check_within(path, lower, upper) for path in paths], axis=0)
     for path in paths:
@@ -295,6 +281,38 @@ def plan(
         sigma=sigma,
         source=calibrated.source or str(source),
     )
+
+
+def _check_request(settings: PlanSettings, model: Path | None) -> None:
+    """Refuse settings that contradict each other."""
+    if settings.shorten and settings.lines:
+        raise UsageError(
+            "--shorten cannot be combined with --line: straight lines leave no path to change; leave one out"
+        )
+    if settings.payloads and model is None:
+        raise UsageError(f"payloads {', '.join(settings.payloads)}: need an identified model; name it (--model)")
+
+
+def _shortened(
+    points: np.ndarray,
+    settings: PlanSettings,
+    motion_limits: MotionLimits,
+    timing_limits: TimingLimits,
+    dynamics: PathDynamics | None,
+    show: Progress,
+) -> Shaped:
+    """Return the path through the waypoints whose shape gives the shortest time within all limits."""
+    positions = motion_limits.positions
+
+    def duration(path: JointPath) -> float:
+        check_within(path, positions.lower, positions.upper)
+        _check_constraints(path, motion_limits)
+        return time_optimal(path, timing_limits, dynamics, grid=COARSE_GRID).duration
+
+    def report(timing_count: int, best: float) -> None:
+        show(f"shaping the path: {best:.4f} s after {timing_count} timings")
+
+    return shorten(points, duration, settings.shorten, settings.stray, report)
 
 
 def _read_drives(tables: Tables | None, chain: Chain) -> dict[str, np.ndarray]:

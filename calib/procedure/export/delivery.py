@@ -346,18 +346,25 @@ def check_into(export: Export, into: Path, folder: Path) -> None:
     check_target(into, names, marks, "export", [export.urdf, *results(folder)])
 
 
-def verdicts(folder: Path) -> Verdicts:
-    """Return the verdicts on a fit or an identification, from its folder; in a session, on unseen rows.
+def fit_verdicts(folder: Path) -> Verdicts:
+    """Return the verdicts on a fit and its deliverables, from its folder; in a session, on unseen poses.
 
     Empty where the folder is of an earlier version and does not say it, or where its session has yet to judge it.
     """
     try:
-        if IdentificationFolder(folder).model.is_file():
-            return Verdicts(_stage_verdict("dynamics", _identification_record(folder)))
         record = _fit_record(folder)
-        return Verdicts(_stage_verdict("geometry", record), record.deliverables)
     except UsageError:
         return Verdicts()
+    return Verdicts(_stage_verdict("geometry", record), record.deliverables)
+
+
+def model_verdicts(folder: Path) -> Verdicts:
+    """Return the verdict on an identification, from its folder; in a session, on unseen motion. Empty as of a fit."""
+    try:
+        record = _identification_record(folder)
+    except UsageError:
+        return Verdicts()
+    return Verdicts(_stage_verdict("dynamics", record))
 
 
 def _identification_record(folder: Path) -> UnseenReport | ModelMetrics:

@@ -13,7 +13,7 @@ from calib.dynamics import pseudo_inertia, rigid_body
 from calib.dynamics.bodies import Bodies, bodies_of
 from calib.dynamics.drives import DriveTerm
 from calib.errors import RobotError, finding, listing
-from calib.identification.model_file import MODEL, refuse_currents
+from calib.identification.model_file import refuse_currents
 from calib.identification.physical_consistency.information import Information
 from calib.identification.physical_consistency.information import read as read_information
 from calib.identification.physical_consistency.solve import PossibleBodies, find_possible
@@ -85,11 +85,6 @@ class IdentifiedRobot:
     def arm(self) -> Bodies:
         """Bodies of the arm with the gravity of the identification."""
         return bodies_of(self.chain).with_gravity(self.found.dynamics.model.bodies.gravity)
-
-
-def is_identified(folder: Path) -> bool:
-    """Return whether a folder is that of an identification."""
-    return (folder / MODEL).is_file()
 
 
 def read(folder: Path, prior: str = "entropic") -> IdentifiedRobot:

@@ -169,26 +169,14 @@ def run(
     nominal = selection.nominal.cell
     _check_convergence(selection, inputs, options)
 
-    # Row changes that explain the rigid misfit stand in its place.
     changes = row_changes(selection.rigid)
-    explained = bool(changes) and changes[-1].values["after"] < plausibility.FLOOR * nominal.reach
-    rigid_misfit = None
-    if not explained:
-        rigid_misfit = misfit(selection, nominal.reach)
-    if rigid_misfit and weighing.loss in HEEDS_ALL:
-        robust = climb("geometry", settings=replace(weighing, loss="cauchy"))
-        rigid_misfit = gross_rows(selection, robust, nominal.reach) or rigid_misfit
+    rigid_misfit = _rigid_misfit(selection, changes, climb, weighing)
 
     progress("comparing on unseen poses")
     weighing = replace(weighing, loss=selection.loss)
     rigid = selection.rigid_fit(inputs.fit, weighing, inputs.bare)
     outliers = named_outliers(selection.fit)
-    notes = list(changes)
-    if rigid_misfit:
-        notes.append(rigid_misfit)
-    notes += _moved_between(nominal, inputs.fit, weighing)
-    notes += diagnose(selection.fit, with_changes=not changes)
-    notes += image_notes(selection.fit)
+    notes = _residual_findings(selection, inputs, changes, rigid_misfit, weighing)
     if prediction is not None:
         ratio = compared_with_fit(prediction, selection.fit)
         if ratio is not None:
@@ -219,6 +207,44 @@ def run(
         options=options,
         expected=expected,
     )
+
+
+def _rigid_misfit(
+    selection: ModelSelection, changes: Sequence[Finding], climb: Callable[..., ModelSelection], weighing: Settings
+) -> Finding | None:
+    """Return the finding that no rigid geometry explains the rows, or that a few grossly wrong rows are the reason.
+
+    Args:
+        selection: of models.
+        changes: of rows; those that explain the misfit stand in its place.
+        climb: selects models on the same rows with another loss.
+        weighing: of the selection.
+    """
+    reach = selection.nominal.cell.reach
+    if changes and changes[-1].values["after"] < plausibility.FLOOR * reach:
+        return None
+    rigid_misfit = misfit(selection, reach)
+    if rigid_misfit and weighing.loss in HEEDS_ALL:
+        robust = climb("geometry", settings=replace(weighing, loss="cauchy"))
+        return gross_rows(selection, robust, reach) or rigid_misfit
+    return rigid_misfit
+
+
+def _residual_findings(
+    selection: ModelSelection,
+    inputs: Inputs,
+    changes: Sequence[Finding],
+    rigid_misfit: Finding | None,
+    weighing: Settings,
+) -> list[Finding]:
+    """Return the findings on the residuals of a fit: changed rows, misfit, moved instrument, joints, images."""
+    notes = list(changes)
+    if rigid_misfit:
+        notes.append(rigid_misfit)
+    notes += _moved_between(selection.nominal.cell, inputs.fit, weighing)
+    notes += diagnose(selection.fit, with_changes=not changes)
+    notes += image_notes(selection.fit)
+    return notes
 
 
 def _check_convergence(selection: ModelSelection, inputs: Inputs, options: FitOptions) -> None:

@@ -79,6 +79,7 @@ class FitFolder:
 
     robot = InFolder(calibrated.ROBOT)  # the calibrated robot
     urdf = InFolder(URDF)  # the best geometry without joint corrections
+    numbers = InFolder(METRICS)  # with verdict and findings
     report = InFolder(REPORT)  # data of the certificate
     residuals = InFolder(RESIDUALS)  # one row for each measured row
 
@@ -89,7 +90,7 @@ class FitFolder:
 
     def metrics(self) -> FitMetrics:
         """Read the metrics: numbers, verdict and findings."""
-        return _read(FitMetrics, self.path / METRICS)
+        return _read(FitMetrics, self.numbers)
 
     def findings(self) -> Findings:
         """Read the findings of the fit; schema 1 stores them in the report, without the loss."""

@@ -17,7 +17,7 @@ from calib.extensions import Point
 from calib.geometry.first_guess import check_orientations, check_scale
 from calib.geometry.fit import plain_fit
 from calib.geometry.installation import Installation
-from calib.geometry.repeatability import repeated, repeated_rows
+from calib.geometry.repeatability import repeated, repeated_rows, without_copies
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.robot_kinds import joints_of
 from calib.robot import calibrated, description
@@ -149,15 +149,17 @@ def gather(
     read_blocks: list[tuple[Path, PoseMeasurements]] = []
     for path, source in zip(paths, measured):
         read_blocks += [(path, block) for block in read_file(source, weighed, options)]
+    notes = remarks(chain)
     unseen: dict[str, Unseen] = {}
     fitted_blocks = []
     for block in _with_station_and_tool_names(read_blocks, options, settings.stations, settings.tools):
+        block, copy_notes = without_copies(block)
+        notes += tuple(copy_notes)
         fitted, held_out = hold_out(block, settings.holdout, settings.seed)
         fitted_blocks.append(fitted)
         if held_out is not None:
             unseen[_free_name(unseen, block.file)] = Unseen(held_out, held_out=True)
 
-    notes = remarks(chain)
     if masses is not None:
         notes += (f"gravity torques of the compliance are those of the masses identified in {settings.masses}",)
     inputs = Inputs(chain, robot_file, tuple(fitted_blocks), unseen, notes, earlier, masses)

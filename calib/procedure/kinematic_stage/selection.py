@@ -1,11 +1,13 @@
 """Selection of the poses to measure: the package `poses` gets a robot's observation Jacobian."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -31,6 +33,9 @@ from calib.procedure.measuring.run import lines as run_lines
 from calib.procedure.robot_kinds import joints_of
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds
+
+if TYPE_CHECKING:
+    from calib.procedure.measuring.camera_view import CameraView
 
 Progress = Callable[[int, int, str], None]
 # postures that see a camera's board, to choose from (our choice)
@@ -154,17 +159,10 @@ def choose(
     if view is not None:
         if progress:
             progress(0, 1, "views of the board")
-        count = min(settings.candidates, VIEWS)
-        feasible = partial(is_feasible, space)
-        candidates = view.draw(count, feasible, limits.lower, limits.upper, settings.seed)
-        if len(candidates) < 2 * m:
-            raise UsageError(
-                f"{len(candidates)} feasible postures see the board, but {2 * m} are needed to choose {m}: "
-                "check carried, stands, tilt and range in [camera]"
-            )
+        candidates = _draw_views(view, space, limits, settings, m)
 
-    # `select_poses` checks index and method
-    index, method = cast(Any, settings.index), cast(Any, settings.method)
+    # `select_poses` checks it
+    index = cast(Any, settings.index)
     existing_jacobian = existing_value = None
     notes = list(limits.notes)
     if existing is not None:
@@ -174,16 +172,7 @@ def choose(
         infeasible = int((~is_feasible(space, existing_q)).sum())
         if infeasible:
             notes.append(f"{infeasible} of the {len(existing_q)} existing poses break the constraints")
-    search = SearchSettings(
-        index,
-        method,
-        settings.candidates,
-        settings.seed,
-        starts=settings.starts,
-        evaluations=settings.evaluations,
-        seconds=np.inf if settings.seconds is None else settings.seconds,
-        climbs=settings.climbs,
-    )
+    search = _search_settings(settings)
     if candidates is None:
         candidates = _draw_feasible(space, limits, settings)
     selection = select_poses(
@@ -191,7 +180,7 @@ def choose(
     )
     # the selection without sight limits is not polished: the start of a polished one compares with it
     comparable = selection.value
-    if method == "polish":
+    if settings.method == "polish":
         comparable = float(selection.history[0])
     if view is not None:
         notes.append(view.assumed)
@@ -216,6 +205,38 @@ def choose(
         run=driven.run,
         driven=settings.run,
         by_images=view is not None,
+    )
+
+
+def _draw_views(
+    view: CameraView, space: SearchSpace, limits: Limits, settings: SelectionSettings, m: int
+) -> np.ndarray:
+    """Return feasible postures (N, n) that see the board, at least twice as many as are to be chosen."""
+    count = min(settings.candidates, VIEWS)
+    feasible = partial(is_feasible, space)
+    candidates = view.draw(count, feasible, limits.lower, limits.upper, settings.seed)
+    if len(candidates) < 2 * m:
+        raise UsageError(
+            f"{len(candidates)} feasible postures see the board, but {2 * m} are needed to choose {m}: "
+            "check carried, stands, tilt and range in [camera]"
+        )
+    return candidates
+
+
+def _search_settings(settings: SelectionSettings) -> SearchSettings:
+    """Return the settings of the search; `select_poses` checks index and method."""
+    seconds = np.inf
+    if settings.seconds is not None:
+        seconds = settings.seconds
+    return SearchSettings(
+        cast(Any, settings.index),
+        cast(Any, settings.method),
+        settings.candidates,
+        settings.seed,
+        starts=settings.starts,
+        evaluations=settings.evaluations,
+        seconds=seconds,
+        climbs=settings.climbs,
     )
 
 

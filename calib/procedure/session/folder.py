@@ -208,6 +208,11 @@ class Session:
         """The folder of the export, relative to the session's folder."""
         return EXPORT[self.dynamic]
 
+    @property
+    def concluded(self) -> bool:
+        """Whether the session has come to a verdict."""
+        return self.path(VERDICT).exists()
+
     def write_state(self, state: StateFile) -> None:
         """Write `state` to ``state.json``, completely or not at all."""
         files.write_json(self.path(STATE), {"schema": SCHEMA, **plain(state)})

@@ -58,8 +58,8 @@ class _ShortParameter(NamedTuple):
     def left(self, before: np.ndarray, after: np.ndarray) -> float:
         """Return the error [%] that remains once the torques' σ (n,) by the parameters has fallen."""
         then = 100.0 * before[self.joint] / self.size
-        after_ = 100.0 * after[self.joint] / self.size
-        return float(np.sqrt(max(self.error**2 - then**2 + after_**2, 0.0)))
+        after_percent = 100.0 * after[self.joint] / self.size
+        return float(np.sqrt(max(self.error**2 - then**2 + after_percent**2, 0.0)))
 
 
 def extend(session: Session, say: Say) -> list[str]:

@@ -144,8 +144,8 @@ class FitSection:
     """Section ``[fit]``: fit and validation of the geometry.
 
     Attributes:
-        model: or frames, offsets, geometry, stiffness, bending, coupling, harmonics, wobble
-        loss: or none, huber, cauchy; auto: robust if rows are grossly wrong
+        model: or {others}
+        loss: or {others}; auto: robust if rows are grossly wrong
         options: a TOML file next to this one: column names, units; see `calib formats options`
         stations: base placements of the robot: each (one per measured file) or one (the same for all files)
         validation_frames: base and tool placement of validation files: fit (as fitted) or own (fitted anew)
@@ -186,7 +186,7 @@ class DynamicsSection:
         evaluations: largest number of motions that are evaluated per start
         limits: a TOML file next to this one; see `calib formats limits`
         torques: motor, link (sensors behind the gears), or both
-        friction: or standard, or one step of the ladder; see calib identify --friction
+        friction: or standard, or one step of the ladder; see `calib formats identify-options`
         method: or ols, irls, tls, …; see calib study --list-methods
         options: a TOML file next to this one; see `calib formats identify-options`; for methods with a [loop] the
             designed motion is the reference of recordings without columns q_ref

@@ -19,6 +19,7 @@ from sessions import begin, go_on
 from starlette.testclient import TestClient
 
 from calib.apps.cell_demo import demo
+from calib.apps.serve import pages
 from calib.apps.serve.pages import application
 from calib.apps.serve.work import CHECK, NEXT, Work
 from calib.procedure.session import commands, steps
@@ -57,7 +58,7 @@ def bring(client: TestClient, kind: str, name: str, content: bytes = b"x\n1\n") 
 def test_the_page_says_what_calib_next_says(session: Session, client: TestClient, monkeypatch) -> None:
     assert "read the robot" in client.get("/").text
     waits = steps.State(steps.find(session, "measure"), steps.WAITING, "a file of measured poses")
-    monkeypatch.setattr(steps, "states", lambda _: [waits])
+    monkeypatch.setattr(pages, "step_states", lambda _: [waits])
     task, file = commands.asks(session, waits)
     shown = re.sub("<.*?>", "", unescape(client.get("/").text))
     lines = [line.partition(" ")[2] for line in task.splitlines()]

@@ -166,10 +166,10 @@ def test_a_trial_is_pure():
 
 def test_a_loop_that_cannot_be_recorded_is_a_row(monkeypatch: pytest.MonkeyPatch):
     """An unstable controller is counted, and ends nothing."""
-    from calib.simulation import known_robots
+    from calib.apps.studies import experiment
 
-    stiff = known_robots.controller("rv2sq").scaled(100.0)
-    monkeypatch.setattr(known_robots, "controller", lambda name: replace(stiff, limit=np.full(6, np.inf)))
+    stiff = experiment.published_controller("rv2sq").scaled(100.0)
+    monkeypatch.setattr(experiment, "published_controller", lambda name: replace(stiff, limit=np.full(6, np.inf)))
     forget()
     row = run_trial(SHORT, "wls", 0)
     forget()

@@ -9,7 +9,6 @@ import pytest
 from differences import check
 
 import calib
-from calib.apps.viewer.scene import is_run, rehearsed_samples
 from calib.cli import run
 from calib.config import parse
 from calib.errors import UsageError
@@ -22,6 +21,7 @@ from calib.procedure.measuring.pose_limits import Limits, limits_of, read_limits
 from calib.procedure.measuring.prediction import predicted
 from calib.procedure.measuring.run import Exchange, RunSettings, drivable, plan_run, turns, write_run
 from calib.procedure.session.questions import cell_tables
+from calib.results.scene import is_run, rehearsed_samples
 from calib.robot.chain import Chain, random_joints
 from calib.robot.library import load
 

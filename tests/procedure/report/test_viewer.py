@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from calib import cli
-from calib.apps.viewer import scene as viewing
 from calib.apps.viewer import viewer
-from calib.apps.viewer.scene import visuals
 from calib.errors import UsageError
 from calib.geometry import installation
+from calib.results import scene as viewing
+from calib.results.scene import visuals
 from calib.robot.formats import urdf_write
 from calib.robot.kinematics import forward
 from calib.robot.library import load

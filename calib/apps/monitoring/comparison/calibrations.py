@@ -8,15 +8,9 @@ from functools import cached_property
 import numpy as np
 
 from calib.apps.monitoring.comparison.places import Place, check_same_robot
-from calib.geometry import installation
-from calib.geometry.installation import Installation
-from calib.geometry.observation import layout
-from calib.procedure.kinematic_stage import tables
-from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
-from calib.robot import calibrated
-from calib.robot.calibrated import CalibratedChain, Deflection
-from calib.robot.chain import Chain
-from calib.robot.library import load_calibrated
+from calib.toolkit.chains import CalibratedChain, Chain, Deflection, load_calibrated, read_calibrated
+from calib.toolkit.installations import Installation, layout, read_installation
+from calib.toolkit.result_folders import ComparedRows, FitMetrics, read_covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,11 +102,11 @@ def read_fit(place: Place) -> Calibration:
     """Return the calibration in the folder of a fit or a session."""
     folder, session = place.fit, place.session
     assert folder is not None
-    metrics, cell = folder.metrics(), installation.read(folder.path)
+    metrics, cell = folder.metrics(), read_installation(folder.path)
     verdict_metrics = session.validation.metrics() if session and (session.validation.judged).exists() else metrics
     unseen = [rows for rows in verdict_metrics.validation.values() if rows.unseen]
-    free, covariance = tables.read_covariance(folder.path, cell)
-    robot = calibrated.read(folder.path)
+    free, covariance = read_covariance(folder.path, cell)
+    robot = read_calibrated(folder.path)
     tolerance_mm = session.settings.fit.tolerance_mm if session else metrics.tolerance_mm
     return Calibration(
         place.name,

@@ -12,12 +12,12 @@ import numpy as np
 
 from calib.apps.monitoring.comparison.change_test import ChangeTest
 from calib.errors import Finding, finding
-from calib.procedure.findings import Verdict, lines_of, settle
-from calib.procedure.report.page import Block, KeyFigure, RecordColumn, Section, Text, met, table
+from calib.toolkit.report_pages import Block, KeyFigure, RecordColumn, Section, Text, met, table
+from calib.toolkit.result_folders import Verdict, lines_of, settle
 from calib.units import SMALL
 
 if TYPE_CHECKING:
-    from calib.procedure.report.charts import Chart
+    from calib.toolkit.report_charts import Chart
 
 MOST = 12  # parameters shown; all are in the table on disk
 

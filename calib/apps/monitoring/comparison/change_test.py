@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2, norm
 
-from calib.procedure.findings import limit
+from calib.toolkit.result_folders import limit
 
 SPAN = 1e-5  # sine of an angle below which two combinations are one
 CHANCE = 0.01  # probability below which a χ² is no chance, as 2.6 σ

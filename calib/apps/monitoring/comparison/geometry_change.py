@@ -16,11 +16,8 @@ from calib.apps.monitoring.comparison.calibrations import Calibration
 from calib.apps.monitoring.comparison.change_test import ChangeTest, ParameterChange, Tested, span, tested
 from calib.apps.monitoring.settings import DiffSettings
 from calib.errors import UsageError, require
-from calib.geometry.installation import Installation, NoOptics, see
-from calib.geometry.model_choice.cross_validation import project_out
-from calib.geometry.observation import layout_counts, target_jacobian
-from calib.robot.calibrated import evaluate
-from calib.robot.chain import random_joints
+from calib.toolkit.chains import evaluate, random_joints
+from calib.toolkit.installations import Installation, NoOptics, layout_counts, project_out, see, target_jacobian
 from calib.transforms import invert, rotation_vector
 
 LEVER = 0.1  # that weighs a target's turn against its way [m/rad]: a tool's usual length (our choice)

@@ -10,15 +10,16 @@ import numpy as np
 
 from calib import folders
 from calib.apps.monitoring.comparison.places import Place, check_same_robot
-from calib.data.csv_table import read_table
-from calib.dynamics.base import standard_name
-from calib.dynamics.idim import IdentificationModel
 from calib.errors import UsageError, require
-from calib.identification import model_file
-from calib.identification.prediction import Dynamics
-from calib.identification.uncertainty.torque_errors import estimated_columns
-from calib.robot import calibrated
-from calib.robot.calibrated import CalibratedChain
+from calib.toolkit.chains import CalibratedChain, read_calibrated
+from calib.toolkit.pose_data import read_table
+from calib.toolkit.torque_models import (
+    Dynamics,
+    IdentificationModel,
+    estimated_columns,
+    read_model_table,
+    standard_name,
+)
 from calib.units import TORQUE
 
 
@@ -102,7 +103,7 @@ def read_models(before: Place, after: Place) -> tuple[Identified, Identified]:
 def _read(place: Place) -> Identified:
     folder, session = place.identification, place.session
     assert folder is not None
-    dynamics, metrics, table = folder.dynamics(), folder.metrics(), model_file.read_table(folder.path)
+    dynamics, metrics, table = folder.dynamics(), folder.metrics(), read_model_table(folder.path)
     names, covariance = folders.read_covariance(folder.path)
     measured = ~np.isin(names, metrics.switched_off)
     standard = dynamics.model.names
@@ -115,7 +116,7 @@ def _read(place: Place) -> Identified:
     motions = {name: read_states(path, dynamics.model.n) for name, path in tables.items()}
     return Identified(
         place.name,
-        calibrated.read(folder.path),
+        read_calibrated(folder.path),
         dynamics,
         names,
         tuple(units[standard_name(name, standard)] for name in names),

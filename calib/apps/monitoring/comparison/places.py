@@ -8,14 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from calib.errors import RobotError, UsageError, command_line, listing, require
-from calib.folders import COVARIANCE, METRICS, SESSION
-from calib.identification.model_file import MODEL
-from calib.procedure.dynamic_stage.folder import IdentificationFolder
-from calib.procedure.kinematic_stage.folder import FitFolder
-from calib.procedure.session.folder import Session, open_session
 from calib.result_kinds import refusal
-from calib.robot.calibrated import CalibratedChain
-from calib.robot.chain import Element
+from calib.toolkit.chains import CalibratedChain, Element
+from calib.toolkit.opened_results import open_result
+from calib.toolkit.result_folders import FitFolder, IdentificationFolder
+from calib.toolkit.sessions import Session
 
 SAME = 1e-9  # of two nominal descriptions: largest difference [m, rad] that rounding in files explains
 
@@ -63,17 +60,10 @@ def place_of(source: str | Path, verb: str = "diff") -> Place:
     path, name = Path(source), str(source)
     if not path.is_dir():
         return Place(name)
-    if (path / SESSION).exists():
-        session = open_session(path)
-        fit, model = session.fit, session.identification
-        fitted = session.geometric and (fit.path / METRICS).exists() and (fit.path / COVARIANCE).exists()
-        identified = session.dynamic and model.numbers.exists() and model.unseen.report.exists()
-        return Place(name, session, fit if fitted else None, model if identified else None)
-    if (path / MODEL).exists():
-        return Place(name, None, None, IdentificationFolder(path))
-    fitted = (path / METRICS).exists() and FitFolder(path).robot.exists()
-    require(fitted, refusal(path, verb), UsageError)
-    return Place(name, None, FitFolder(path))
+    result = open_result(path, verb)
+    fit, identification = result.fit(verb), result.identification
+    require(result.session or fit or identification, refusal(path, verb), UsageError)
+    return Place(name, result.session, fit, identification)
 
 
 def check_same_robot(names: tuple[str, str], robots: tuple[CalibratedChain, CalibratedChain]) -> None:

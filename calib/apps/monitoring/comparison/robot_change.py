@@ -6,9 +6,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calib.api.dynamic import DynamicsModel
-from calib.api.kinematic import GeometryFit
-from calib.api.rendering import ChartedResult, Judged, saved
 from calib.apps.monitoring import pages
 from calib.apps.monitoring.comparison import geometry_change, torque_change
 from calib.apps.monitoring.comparison.calibrations import read_fits
@@ -23,13 +20,13 @@ from calib.apps.monitoring.comparison.torque_part import TorquePart
 from calib.apps.monitoring.settings import DEFAULT_DIFF, DiffSettings
 from calib.arguments import checked
 from calib.errors import Finding, UsageError, require
-from calib.procedure.findings import LEVELS, Verdict
-from calib.procedure.report.page import Section
-from calib.procedure.robot_kinds import stage_of
 from calib.records import plain
+from calib.result_kinds import BY_NAME
+from calib.toolkit.report_pages import Section
+from calib.toolkit.result_folders import LEVELS, ChartedResult, DynamicsModel, GeometryFit, Judged, Verdict, saved
 
 if TYPE_CHECKING:
-    from calib.procedure.report.charts import Chart
+    from calib.toolkit.report_charts import Chart
 
 TABLES = (ToolPart.table, TorquePart.table)
 
@@ -44,6 +41,7 @@ class RobotChange(ChartedResult, Judged):
 
     parts: tuple[ChangePart, ...]
 
+    kind = BY_NAME["comparison"]
     tab = "verdict geometry dynamics noticed plot save to_dict"
 
     @property
@@ -135,8 +133,6 @@ def diff(before: Compared, after: Compared, settings: DiffSettings = DEFAULT_DIF
         RobotError: where they are of different robots.
     """
     with saved(before) as first, saved(after) as second:
-        for path in (first, second):
-            stage_of(path, "diff")
         earlier, later = place_of(first), place_of(second)
         parts = [*_tool_parts(earlier, later, settings), *_torque_parts(earlier, later, settings)]
     if earlier.nominal and later.nominal:

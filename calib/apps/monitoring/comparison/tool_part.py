@@ -13,12 +13,11 @@ from calib.apps.monitoring.comparison.change_part import ChangePart
 from calib.apps.monitoring.comparison.geometry_change import ToolMotion
 from calib.apps.monitoring.settings import DEFAULT_DIFF, DiffSettings
 from calib.errors import Finding, finding
-from calib.procedure.report.fit_report import FittedParameter
-from calib.procedure.report.page import Block, RecordColumn, Text, table
+from calib.toolkit.report_pages import Block, FittedParameter, RecordColumn, Text, table
 from calib.units import JOINT
 
 if TYPE_CHECKING:
-    from calib.procedure.report.charts import Chart
+    from calib.toolkit.report_charts import Chart
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +124,7 @@ class ToolPart(ChangePart):
         )
 
     def charts(self) -> dict[str, Chart]:
-        from calib.procedure.report.geometry_figures import error_map, parameter_changes
+        from calib.toolkit.report_charts import error_map, parameter_changes
 
         motion = self.found.motions[0]
         arm = {element.name: k for k, element in enumerate(self.before.chain.elements)}

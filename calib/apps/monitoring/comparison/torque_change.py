@@ -15,9 +15,7 @@ import numpy as np
 
 from calib.apps.monitoring.comparison.change_test import ChangeTest, ParameterChange, Tested, tested
 from calib.apps.monitoring.comparison.identifications import Identified, MotionStates
-from calib.dynamics.base import standard_name
-from calib.dynamics.idim import IdentificationModel
-from calib.identification.uncertainty.torque_errors import parameter_variances
+from calib.toolkit.torque_models import IdentificationModel, parameter_variances, standard_name
 
 PARALLEL = 1e-6  # sine of an angle between what two parameters do to the combinations, below which they are one
 NEARLY_ALL = 0.9  # of χ²; σ of real motions holds no unmodelled effects, which leave a rest (our choice)

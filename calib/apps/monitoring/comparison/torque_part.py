@@ -11,10 +11,10 @@ import numpy as np
 from calib.apps.monitoring.comparison.change_part import ChangePart
 from calib.apps.monitoring.comparison.torque_change import TorqueChange
 from calib.errors import Finding, finding
-from calib.procedure.report.page import Block, RecordColumn, Text, table
+from calib.toolkit.report_pages import Block, RecordColumn, Text, table
 
 if TYPE_CHECKING:
-    from calib.procedure.report.charts import Chart
+    from calib.toolkit.report_charts import Chart
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,8 +117,7 @@ class TorquePart(ChangePart):
         return text
 
     def charts(self) -> dict[str, Chart]:
-        from calib.procedure.report.charts import Chart, Panel, line
-        from calib.procedure.report.style import AFTER, QUIET
+        from calib.toolkit.report_charts import AFTER, QUIET, Chart, Panel, line
 
         change, panels = self.judged, []
         for j, name in enumerate(self.after.rows):

@@ -7,14 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
-from calib.errors import UsageError, command_line, require
-from calib.folders import SESSION
 from calib.procedure.answers import CertificateSection
 from calib.procedure.report.certificate import rendering
 from calib.procedure.report.certificate.record import NO_DETAILS, Certificate, Entry, Page, records, report
 from calib.procedure.report.page import Picture, Section
 from calib.procedure.report.templates import versions
-from calib.result_kinds import refusal
 from calib.units import DEG
 
 if TYPE_CHECKING:
@@ -32,22 +29,11 @@ def write_fit(found: Report, drawn: Mapping[str, Picture], folder: Path) -> None
     rendering.write(folder, *of_fit(found, drawn))
 
 
-def read(folder: Path, plots: bool, details: CertificateSection) -> tuple[Certificate, Page]:
-    """Return certificate and report of the fit or identification in a folder.
-
-    Raises:
-        UsageError: where there is none, or it is a session's, which has a certificate of its own.
-    """
-    from calib.procedure.dynamic_stage.folder import IdentificationFolder
+def read_fit(folder: Path, plots: bool, details: CertificateSection) -> tuple[Certificate, Page]:
+    """Return certificate and report of the fit in a folder."""
     from calib.procedure.kinematic_stage.folder import FitFolder
     from calib.procedure.report import fit_report
 
-    redo = command_line("redo", folder.parent, "certificate")
-    words = f"{folder} belongs to a session, which has the certificate: {redo}"
-    require(not (folder.absolute().parent / SESSION).exists(), words, UsageError)
-    if IdentificationFolder(folder).model.exists():
-        return _read_model(folder, plots, details)
-    require(FitFolder(folder).report.exists(), refusal(folder, "certificate"), UsageError)
     found, drawn = fit_report.read(FitFolder(folder).report), {}
     if plots:
         from calib.procedure.report.charts import pictures
@@ -108,7 +94,8 @@ def write_model(found: DynamicReport, drawn: Mapping[str, Picture], folder: Path
     rendering.write(folder, *of_model(found, drawn))
 
 
-def _read_model(folder: Path, plots: bool, details: CertificateSection) -> tuple[Certificate, Page]:
+def read_model(folder: Path, plots: bool, details: CertificateSection) -> tuple[Certificate, Page]:
+    """Return certificate and report of the identification in a folder."""
     from calib.procedure.report import dynamics_section
 
     found, drawn = dynamics_section.read(folder), {}

@@ -1,0 +1,203 @@
+"""Calibrated robots in their folders: fits, identifications, descriptions made from them, sessions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from calib.errors import RobotError, UsageError, command_line, refused_as, require
+from calib.folders import COVARIANCE, SESSION
+from calib.procedure.answers import CertificateSection
+from calib.procedure.dynamic_stage.folder import IdentificationFolder
+from calib.procedure.export import delivery, geometry
+from calib.procedure.findings import NOT_JUDGED, Verdict, Verdicts
+from calib.procedure.kinematic_stage.folder import FitFolder
+from calib.procedure.report.certificate import results as certificates
+from calib.procedure.robot_kinds import mechanism, stage_of
+from calib.procedure.session.folder import Session, open_session
+from calib.result_kinds import BY_NAME
+from calib.results.result import Exported, ExportSettings, StoredResult, Viewed
+from calib.robot.library import resolve
+
+if TYPE_CHECKING:
+    from calib.procedure.report.certificate.record import Certificate, Page
+    from calib.procedure.report.page import Picture
+
+
+class CalibratedRobot(Viewed):
+    """A folder with a robot that was calibrated from a nominal one (``robot.toml``)."""
+
+    kind = BY_NAME["robot"]
+
+    def export(self, into: Path, settings: ExportSettings) -> Exported:
+        """Write the robot for other programs: all files into a folder, or a ROS 2 package below it."""
+        stage = stage_of(self.path, "export")
+        if stage is not None:
+            message = f"ros2 {settings.ros2}: a package is written of serial arms only"
+            require(not settings.ros2, message, UsageError)
+            return Exported((), stage.run(self.path, into, urdf=settings.urdf, prior=settings.prior))
+        sources = self._export_sources(settings)
+        if settings.ros2:
+            from calib.procedure.export.ros2_package import write_package
+
+            remark = self.verdicts.of("urdf", dynamics=True).remark
+            lines = write_package(
+                replace(sources, remark=remark),
+                settings.ros2,
+                into,
+                moveit=settings.moveit,
+                control=settings.control,
+                overwrite=settings.overwrite,
+            )
+            return Exported((), lines)
+        delivery.check_into(sources, into, self.path)
+        lines = delivery.deliver(sources, into)
+        return Exported(delivery.mark(into, self.verdicts), lines)
+
+    def _export_sources(self, settings: ExportSettings) -> delivery.Export:
+        """Return what an export reads: the fit, and the description that it was made from where none is given."""
+        if settings.urdf is not None:
+            return delivery.Export(settings.urdf, self.path)
+        source = geometry.read(self.path).source
+        message = f"{self.path} was fitted from {source}, which is missing: give the robot's URDF (argument urdf)"
+        with refused_as(UsageError, RobotError, message):
+            return delivery.Export(resolve(source), self.path)
+
+    def _refuse_in_session(self) -> None:
+        """Refuse a certificate of a session's step: the session has one."""
+        folder = self.path
+        redo = command_line("redo", folder.parent, "certificate")
+        words = f"{folder} belongs to a session, which has the certificate: {redo}"
+        require(not (folder.absolute().parent / SESSION).exists(), words, UsageError)
+
+
+class StoredFit(CalibratedRobot):
+    """A fitted geometry, of `calib fit`, `tool`, `base` or `hand-eye`."""
+
+    kind = BY_NAME["fit"]
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict: in a session that on its unseen poses."""
+        return self.verdicts.stages.get("geometry", super().verdict)
+
+    @property
+    def verdicts(self) -> Verdicts:
+        if mechanism(self.path) is not None:
+            return Verdicts({"geometry": super().verdict})
+        return delivery.fit_verdicts(self.path)
+
+    def fit(self, verb: str) -> FitFolder:
+        stage_of(self.path, verb)
+        return FitFolder(self.path)
+
+    def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
+        """Return certificate and report."""
+        self._refuse_in_session()
+        if not FitFolder(self.path).report.exists():
+            self.refuse("certificate")
+        return certificates.read_fit(self.path, plots, details)
+
+
+class StoredIdentification(CalibratedRobot):
+    """Identified dynamics, with the geometry that they stand on."""
+
+    kind = BY_NAME["identification"]
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict: in a session that on its unseen motion."""
+        return self.verdicts.stages.get("dynamics", super().verdict)
+
+    @property
+    def verdicts(self) -> Verdicts:
+        return delivery.model_verdicts(self.path)
+
+    @property
+    def identification(self) -> IdentificationFolder:
+        return IdentificationFolder(self.path)
+
+    def _export_sources(self, settings: ExportSettings) -> delivery.Export:
+        return delivery.Export(settings.urdf, identified=self.path, prior=settings.prior)
+
+    def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
+        """Return certificate and report."""
+        self._refuse_in_session()
+        return certificates.read_model(self.path, plots, details)
+
+
+class StoredSession(Viewed):
+    """A session, with the calibrations that its steps have come to."""
+
+    kind = BY_NAME["session"]
+
+    @cached_property
+    def _session(self) -> Session:
+        return open_session(self.path)
+
+    @property
+    def session(self) -> Session:
+        return self._session
+
+    @property
+    def finished(self) -> bool:
+        """Whether the session has come to a verdict."""
+        return self.session.concluded
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst of its stages' verdicts."""
+        verdicts = self.verdicts
+        if not verdicts.level:
+            return Verdict(NOT_JUDGED, f"no verdict yet: {command_line('next', self.path)}")
+        worst = next(verdict for verdict in verdicts.stages.values() if verdict.level == verdicts.level)
+        return Verdict(worst.level, str(verdicts))
+
+    @property
+    def verdicts(self) -> Verdicts:
+        return self.session.verdicts() if self.finished else Verdicts()
+
+    def fit(self, verb: str) -> FitFolder | None:
+        folder = self.session.fit
+        complete = folder.numbers.exists() and (folder.path / COVARIANCE).exists()
+        return folder if self.session.geometric and complete else None
+
+    @property
+    def identification(self) -> IdentificationFolder | None:
+        folder = self.session.identification
+        judged = folder.numbers.exists() and folder.unseen.report.exists()
+        return folder if self.session.dynamic and judged else None
+
+    def figures(self) -> dict[str, Picture]:
+        """Return the figures of the steps by name, as ``4-fit/map``."""
+        result = {}
+        for name, folder in (("fit", self.fit("view")), ("dynamics", self.identification)):
+            if folder is not None:
+                result |= {f"{name}/{key}": value for key, value in StoredResult(folder.path).figures().items()}
+        return result
+
+    def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
+        """Return certificate and report of a finished session."""
+        from calib.procedure.session import certificate
+
+        return certificate.pages(replace(self.session, plots=plots))
+
+    def certify(self, details: CertificateSection, plots: bool, svg: Path | None) -> list[str]:
+        """Write the report's figures as SVG; the certificate is the last step of the session."""
+        from calib.procedure.report.certificate import rendering
+
+        redo = command_line("redo", self.path, "certificate")
+        words = f"{self.path / SESSION} has the details, under [certificate]; then: {redo}"
+        require(details == CertificateSection() and svg is not None, words, UsageError)
+        assert svg is not None
+        report = self.pages(details)[1]
+        return [f"{rendering.write_figures(svg, report)} figures written to {svg}"]
+
+    def status(self) -> Iterator[object]:
+        """Yield the state of each step, and the next command."""
+        from calib.procedure.session import commands
+
+        return commands.status_lines(self.path)

@@ -1,0 +1,198 @@
+"""The kinds of results, each registered once, and `open_result`, which opens what a person names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from calib import files
+from calib.data.csv_table import Table, read_table
+from calib.errors import UsageError, require
+from calib.procedure.excitation.coefficients import PLANNED, RUN, SAMPLES
+from calib.procedure.report.page import Picture
+from calib.result_kinds import BY_NAME, kind_of, refusal
+from calib.results.calibrations import CalibratedRobot, StoredFit, StoredIdentification, StoredSession
+from calib.results.result import StoredResult, Viewed
+
+if TYPE_CHECKING:
+    from calib.results.scene import Scene
+
+PICTURE_SUFFIX = ".png"
+
+
+class StoredMotion(Viewed):
+    """A motion to play."""
+
+    def motion(self) -> Path:
+        """Return the file to play: the whole run where there is one."""
+        for name in (RUN, PLANNED, SAMPLES):
+            path = self.path / name
+            if path.is_file():
+                return path
+        self.refuse("program")
+
+
+class StoredExcitation(StoredMotion):
+    """A motion of `calib excite`."""
+
+    kind = BY_NAME["excitation"]
+
+
+class StoredPlan(StoredMotion):
+    """A motion of `calib plan`."""
+
+    kind = BY_NAME["plan"]
+
+
+class StoredFile(StoredResult):
+    """A result that is a file, with others beside it."""
+
+    def beside(self) -> list[Path]:
+        """Return the files that belong to it."""
+        return []
+
+    def tables(self) -> dict[str, Table]:
+        """Return the table of a CSV file."""
+        return {self.path.stem: read_table(self.path)} if self.path.suffix == ".csv" else {}
+
+    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+        """Copy the file, and those beside it under its new name; without figures where `plots` is False.
+
+        Raises:
+            UsageError: where one of them is there.
+        """
+        out = Path(out)
+        copies = {self.path: out}
+        for path in self.beside():
+            if plots or path.suffix != PICTURE_SUFFIX:
+                copies[path] = out.with_name(out.stem + path.name.removeprefix(self.path.stem))
+        for copy in copies.values():
+            require(not copy.exists(), f"{copy} is there already; give another name", UsageError)
+        for path, copy in copies.items():
+            files.write(copy, path.read_bytes())
+        return out
+
+
+class StoredSelection(StoredFile):
+    """Poses of `calib select`: a CSV with its prediction and figures beside it."""
+
+    kind = BY_NAME["selection"]
+
+    def beside(self) -> list[Path]:
+        """Return prediction and figures."""
+        start = self.path.with_suffix("")
+        return [Path(f"{start}{self.kind.companion}"), *sorted(start.parent.glob(f"{start.name}_*{PICTURE_SUFFIX}"))]
+
+    def figures(self) -> dict[str, Picture]:
+        """Return the figures beside the list, by name."""
+        start = f"{self.path.stem}_"
+        paths = [path for path in self.beside() if path.suffix == PICTURE_SUFFIX]
+        return {path.stem.removeprefix(start): Picture(path.read_bytes(), "") for path in paths}
+
+    def scene(self, robot: str | None = None) -> Scene:
+        """Return the poses, of a robot that has to be named."""
+        from calib.results import scene
+
+        return scene.read(self.path, robot)
+
+
+class StoredRecall(StoredFile):
+    """One averaged period of a played motion: an archive of arrays, a recording to identify from."""
+
+    kind = BY_NAME["recall"]
+
+
+class StoredComparison(StoredResult):
+    """What changed between two calibrations."""
+
+    kind = BY_NAME["comparison"]
+
+
+class StoredDrift(StoredResult):
+    """Drift during a measurement."""
+
+    kind = BY_NAME["drift"]
+
+
+class StoredLog(StoredResult):
+    """The calibrations of one robot."""
+
+    kind = BY_NAME["log"]
+
+
+class StoredFleet(StoredResult):
+    """The calibrations of many arms."""
+
+    kind = BY_NAME["fleet"]
+
+
+class StoredStudy(StoredResult):
+    """Trials of identification methods, and what they say."""
+
+    kind = BY_NAME["study"]
+
+
+class StoredExport(StoredResult):
+    """A calibrated robot in the forms that other programs read."""
+
+    kind = BY_NAME["export"]
+
+
+class StoredPackage(StoredResult):
+    """A ROS 2 package."""
+
+    kind = BY_NAME["package"]
+
+
+REGISTERED: tuple[type[StoredResult], ...] = (
+    StoredFit,
+    StoredIdentification,
+    StoredExcitation,
+    StoredPlan,
+    StoredSelection,
+    StoredRecall,
+    StoredComparison,
+    StoredDrift,
+    StoredLog,
+    StoredFleet,
+    StoredSession,
+    StoredStudy,
+    StoredExport,
+    StoredPackage,
+    CalibratedRobot,
+)
+
+
+def open_result(path: str | Path, verb: str = "result") -> StoredResult:
+    """Return the result in a folder or a file.
+
+    Args:
+        path: what a command wrote, or a session.
+        verb: what asks, for the message (`calib.result_kinds.TAKES`).
+
+    Raises:
+        UsageError: where there is no result.
+    """
+    path = Path(path)
+    kind = kind_of(path)
+    if kind is None:
+        raise UsageError(refusal(path, verb))
+    opened = {stored.kind.name: stored for stored in REGISTERED}
+    return opened[kind.name](path)
+
+
+def drawn(path: str | Path, robot: str | None = None) -> Scene:
+    """Return what the viewer draws of a result, of any CSV of poses, or of a folder with several results.
+
+    Args:
+        path: of the result, file or folder.
+        robot: the robot to draw; None for the result's.
+
+    Raises:
+        UsageError: where there is nothing to see.
+    """
+    if kind_of(path) is not None:
+        return open_result(path, "view").scene(robot)
+    from calib.results import scene
+
+    return scene.read(path, robot)

@@ -1,0 +1,46 @@
+"""Measurements: tables, files of measured poses, lists of poses and targets."""
+
+from calib.data.csv_table import Table, opened, plain_rows, read_header, read_table, split_units
+from calib.data.poses import IMAGES
+from calib.data.poses.columns import LATE, OURS, POSITION, QUATERNION, SIGMA, Sheet
+from calib.data.poses.fit_options import FileOptions, FitOptions
+from calib.data.poses.fit_options import read_options as read_fit_options
+from calib.data.poses.measurements import PoseMeasurements, Positions, take
+from calib.data.poses.plausible import check_joints, outside, unit_quaternions
+from calib.data.poses.pose_files import read_measurements
+from calib.data.poses.pose_lists import Targets, read_poses, read_targets
+from calib.data.poses.robodk import recognises as is_robodk_file
+from calib.data.schema import BOUNDS, Joints, max_travel
+
+__all__ = [
+    "BOUNDS",
+    "IMAGES",
+    "LATE",
+    "OURS",
+    "POSITION",
+    "QUATERNION",
+    "SIGMA",
+    "FileOptions",
+    "FitOptions",
+    "Joints",
+    "PoseMeasurements",
+    "Positions",
+    "Sheet",
+    "Table",
+    "Targets",
+    "check_joints",
+    "is_robodk_file",
+    "max_travel",
+    "opened",
+    "outside",
+    "plain_rows",
+    "read_fit_options",
+    "read_header",
+    "read_measurements",
+    "read_poses",
+    "read_table",
+    "read_targets",
+    "split_units",
+    "take",
+    "unit_quaternions",
+]

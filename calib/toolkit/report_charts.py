@@ -1,0 +1,24 @@
+"""Charts: lines, boxes and maps drawn in the style of the reports."""
+
+from calib.procedure.report.charts import Chart, Layer, Panel, box, line, picture, text
+from calib.procedure.report.geometry_figures import error_histogram, error_map, parameter_changes
+from calib.procedure.report.style import AFTER, BEFORE, BROWN, INK, MARK, QUIET
+
+__all__ = [
+    "AFTER",
+    "BEFORE",
+    "BROWN",
+    "INK",
+    "MARK",
+    "QUIET",
+    "Chart",
+    "Layer",
+    "Panel",
+    "box",
+    "error_histogram",
+    "error_map",
+    "line",
+    "parameter_changes",
+    "picture",
+    "text",
+]

@@ -1,0 +1,52 @@
+"""Pages: sections, tables and key figures of reports, the certificate, templates."""
+
+from calib.procedure.answers import CertificateSection
+from calib.procedure.report.certificate.record import Entry
+from calib.procedure.report.certificate.record import report as report_page
+from calib.procedure.report.certificate.rendering import html as as_html
+from calib.procedure.report.certificate.rendering import write as write_certificate
+from calib.procedure.report.certificate.rendering import write_figures
+from calib.procedure.report.fit_report import FittedParameter
+from calib.procedure.report.fit_report import read as read_fit_report
+from calib.procedure.report.page import (
+    Block,
+    KeyFigure,
+    Picture,
+    Pictures,
+    RecordColumn,
+    ReportTable,
+    Section,
+    Text,
+    met,
+    rendered,
+    table,
+)
+from calib.procedure.report.page import section as printed_section
+from calib.procedure.report.templates import filled, issued
+from calib.procedure.report.templates import read as read_template
+
+__all__ = [
+    "Block",
+    "CertificateSection",
+    "RecordColumn",
+    "Entry",
+    "FittedParameter",
+    "KeyFigure",
+    "Picture",
+    "Pictures",
+    "Section",
+    "ReportTable",
+    "Text",
+    "as_html",
+    "filled",
+    "issued",
+    "met",
+    "printed_section",
+    "read_fit_report",
+    "read_template",
+    "rendered",
+    "report_page",
+    "table",
+    "write_certificate",
+    "write_figures",
+]

@@ -1,0 +1,53 @@
+"""Results: their folders, figures and verdicts, and how they are shown."""
+
+from calib.api.dynamic import DynamicsModel
+from calib.api.kinematic import GeometryFit
+from calib.api.rendering import ChartedResult, Judged, saved
+from calib.procedure.dynamic_stage.folder import IdentificationFolder
+from calib.procedure.dynamic_stage.metrics import UnseenReport
+from calib.procedure.export.delivery import fit_verdicts, prediction
+from calib.procedure.export.geometry import read as read_exported
+from calib.procedure.export.geometry import results as geometry_results
+from calib.procedure.findings import LEVELS, Verdict, limit, lines_of, sentence, settle
+from calib.procedure.kinematic_stage.folder import IN_SESSION, URDF, VALIDATED, FitFolder, ValidationFolder
+from calib.procedure.kinematic_stage.inputs import load_robot
+from calib.procedure.kinematic_stage.inputs import read_file as read_measured_file
+from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics, ValidationMetrics
+from calib.procedure.kinematic_stage.settings import FitSettings, Tolerance
+from calib.procedure.kinematic_stage.tables import read_covariance
+from calib.procedure.robot_kinds import joints_of, stage_of
+
+__all__ = [
+    "IN_SESSION",
+    "LEVELS",
+    "URDF",
+    "VALIDATED",
+    "ComparedRows",
+    "ChartedResult",
+    "DynamicsModel",
+    "FitFolder",
+    "FitMetrics",
+    "FitSettings",
+    "GeometryFit",
+    "IdentificationFolder",
+    "Judged",
+    "Tolerance",
+    "UnseenReport",
+    "ValidationFolder",
+    "ValidationMetrics",
+    "Verdict",
+    "fit_verdicts",
+    "geometry_results",
+    "joints_of",
+    "limit",
+    "lines_of",
+    "load_robot",
+    "prediction",
+    "read_covariance",
+    "read_exported",
+    "read_measured_file",
+    "saved",
+    "sentence",
+    "settle",
+    "stage_of",
+]

@@ -1,0 +1,70 @@
+"""Sessions: a guided procedure in a folder, its steps, what they wait for and what they found."""
+
+from calib.procedure.session.certificate import pages as certificate_pages
+from calib.procedure.session.commands import COLOURS, asks, go_on, new_session
+from calib.procedure.session.drift import Trend, noise_of_difference, repeats, trends
+from calib.procedure.session.dynamics_steps import check_recording, designed_motions, next_round
+from calib.procedure.session.folder import (
+    BROUGHT,
+    LOGS,
+    MARK,
+    POSES,
+    ROUND,
+    SETTINGS,
+    UNSEEN,
+    WAYS,
+    Say,
+    Session,
+    locked,
+    open_session,
+    read_state,
+)
+from calib.procedure.session.geometry_steps import chain_of, clear_staging, notes_on, read_measured
+from calib.procedure.session.results import folders_of, position_errors, torque_error
+from calib.procedure.session.steps import DONE, KEPT, WAITING, run_next, steps_of
+from calib.procedure.session.steps import State as StepState
+from calib.procedure.session.steps import find as find_step
+from calib.procedure.session.steps import states as step_states
+
+__all__ = [
+    "BROUGHT",
+    "COLOURS",
+    "DONE",
+    "KEPT",
+    "LOGS",
+    "MARK",
+    "POSES",
+    "ROUND",
+    "SETTINGS",
+    "UNSEEN",
+    "WAITING",
+    "WAYS",
+    "Say",
+    "Session",
+    "StepState",
+    "Trend",
+    "asks",
+    "certificate_pages",
+    "chain_of",
+    "check_recording",
+    "clear_staging",
+    "designed_motions",
+    "find_step",
+    "folders_of",
+    "go_on",
+    "locked",
+    "new_session",
+    "next_round",
+    "noise_of_difference",
+    "notes_on",
+    "open_session",
+    "position_errors",
+    "read_measured",
+    "read_state",
+    "repeats",
+    "run_next",
+    "step_states",
+    "steps_of",
+    "torque_error",
+    "trends",
+]

@@ -1,0 +1,66 @@
+"""Simulation: virtual cells with known truth, arms in closed loop and their controllers."""
+
+from calib.identification.closed_loop.controllers import Reference
+from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun, feed_forward, simulate
+from calib.identification.loop import LoopController, LoopSettings
+from calib.simulation.camera_cell import CameraCell, limits_of, seen_by_camera, take_pictures
+from calib.simulation.cell import (
+    Cell,
+    SimulatedInstrument,
+    measure,
+    planned_poses,
+    wandering,
+    write_log,
+    write_measured,
+)
+from calib.simulation.known_robots import controller as published_controller
+from calib.simulation.known_robots import model as plant_model
+from calib.simulation.known_robots import plant as known_plant
+from calib.simulation.known_robots import random_fourier
+from calib.simulation.known_robots import truth as known_truth
+from calib.simulation.truth import TRUTH, share_within, true_base
+from calib.simulation.truth import position_errors as true_position_errors
+from calib.simulation.truth import torque_errors as true_torque_errors
+from calib.simulation.virtual_arm import REST, MovingArm, moving_arm, play, record, sensed
+from calib.simulation.virtual_cells import perturbed_cell, rigid, virtual_cell
+
+__all__ = [
+    "REST",
+    "TRUTH",
+    "CameraCell",
+    "Cell",
+    "LoopController",
+    "LoopSettings",
+    "MovingArm",
+    "Plant",
+    "Reference",
+    "Sensing",
+    "SimulatedInstrument",
+    "SimulatedRun",
+    "feed_forward",
+    "known_plant",
+    "known_truth",
+    "limits_of",
+    "measure",
+    "moving_arm",
+    "perturbed_cell",
+    "planned_poses",
+    "plant_model",
+    "play",
+    "published_controller",
+    "random_fourier",
+    "record",
+    "rigid",
+    "seen_by_camera",
+    "sensed",
+    "share_within",
+    "simulate",
+    "take_pictures",
+    "true_base",
+    "true_position_errors",
+    "true_torque_errors",
+    "virtual_cell",
+    "wandering",
+    "write_log",
+    "write_measured",
+]

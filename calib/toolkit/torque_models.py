@@ -1,0 +1,52 @@
+"""Dynamics: regressor models, base parameters, drives, identification methods and their problems."""
+
+from calib.dynamics.base import Base, regroup, standard_name
+from calib.dynamics.base import find as find_base
+from calib.dynamics.bodies import bodies_of, with_payload
+from calib.dynamics.drives import term as drive_term
+from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.pseudo_inertia import ball, margin
+from calib.dynamics.torque_rows import MOTOR, ROWS
+from calib.identification.methods.constraint_settings import ConstraintSettings
+from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate
+from calib.identification.model_file import MODEL, read_dynamics
+from calib.identification.model_file import read_table as read_model_table
+from calib.identification.prediction import Dynamics, predict
+from calib.identification.registry import METHODS, VERSIONS, method_named
+from calib.identification.rows import Case, make_case, observe
+from calib.identification.settings import IdentificationSettings
+from calib.identification.uncertainty.torque_errors import estimated_columns, parameter_variances
+
+__all__ = [
+    "METHODS",
+    "MODEL",
+    "MOTOR",
+    "ROWS",
+    "VERSIONS",
+    "Base",
+    "Case",
+    "ConstraintSettings",
+    "Dynamics",
+    "EstimateStatus",
+    "IdentificationModel",
+    "IdentificationProblem",
+    "IdentificationSettings",
+    "Method",
+    "MethodEstimate",
+    "ball",
+    "bodies_of",
+    "drive_term",
+    "estimated_columns",
+    "find_base",
+    "make_case",
+    "margin",
+    "method_named",
+    "observe",
+    "parameter_variances",
+    "predict",
+    "read_dynamics",
+    "read_model_table",
+    "regroup",
+    "standard_name",
+    "with_payload",
+]
