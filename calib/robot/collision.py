@@ -33,10 +33,10 @@ from calib.robot.capsules import (
 )
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf
+from calib.robot.formats.native import NativeModel, NativeShape
 from calib.robot.formats.simulators import configurations, driven_joints, link_frame
 from calib.robot.formats.urdf_tree import Node, is_urdf, numbers, origin, parse, text
 from calib.robot.kinematics import sweep
-from calib.robot.native import NativeModel, NativeShape
 from calib.transforms import pose
 
 PACKAGE_PATH = "ROS_PACKAGE_PATH"

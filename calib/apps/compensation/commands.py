@@ -1,11 +1,12 @@
 """Command for joint commands that reach nominal targets: compensate."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from calib.cli.shared import Out, Seed, command, numbers, progress, say
+from calib.records import FieldValues
 
 app = typer.Typer()
 
@@ -78,7 +79,7 @@ def compensate(
         raise UsageError(f"{targets}: {message}")
     written = [(out, (".csv",) if program is None else (targets.suffix,))]
     files.check_results(written, [targets, *results(fitted.folder)], overwrite)
-    options: dict[str, Any] = {
+    options: FieldValues = {
         "frame": frame,
         "dof": dof,
         "tolerance": (1e-3 * may[0], 1e-3 * may[1]),

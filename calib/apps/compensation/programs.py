@@ -35,6 +35,7 @@ from calib.data.poses.pose_lists import Targets
 from calib.errors import UsageError, listing
 from calib.geometry.installation import see
 from calib.geometry.inverse import Goal
+from calib.records import FieldValues
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +168,7 @@ def _check_postures(fitted: Fitted, program: Program, groups: Sequence[Group], s
 
 
 def _compensated_group(
-    fitted: Fitted, program: Program, group: Group, start: Sequence[float] | None, options: dict[str, Any]
+    fitted: Fitted, program: Program, group: Group, start: Sequence[float] | None, options: FieldValues
 ) -> Part:
     """Return the commands of poses with one tool and configuration."""
     kind, frame, seed = program.controller, options["frame"], options["seed"]

@@ -6,7 +6,6 @@ program sends. For ROS these commands write a JointTrajectory themselves. The mo
 """
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -56,7 +55,7 @@ def setpoints(path: Path, controller: Controller) -> tuple[np.ndarray, list[str]
     return CubicSpline(t, q)(when), [name.removeprefix(PREFIX) for name in names]
 
 
-def stream_values(controller: Controller, q: np.ndarray) -> dict[str, Any]:
+def stream_values(controller: Controller, q: np.ndarray) -> dict[str, object]:
     """Return what the templates of streams print of setpoints (k, n) [rad]."""
     controller_values = controller.shown(q)
     rows = _formatted(controller_values, controller)

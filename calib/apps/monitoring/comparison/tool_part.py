@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from calib.apps.monitoring.comparison.geometry_change import ToolMotion
 from calib.apps.monitoring.settings import DEFAULT_DIFF, DiffSettings
 from calib.errors import Finding, finding
 from calib.toolkit.report_pages import Block, FittedParameter, RecordColumn, Text, table
-from calib.units import JOINT
+from calib.units import JOINT, NamedJoint
 
 if TYPE_CHECKING:
     from calib.toolkit.report_charts import Chart
@@ -140,7 +140,7 @@ class ToolPart(ChangePart):
             result["parameters"] = parameter_changes(rows, of="later - earlier")
         return result
 
-    def numbers(self) -> dict[str, Any]:
+    def numbers(self) -> dict[str, object]:
         motions = {
             motion.where: {
                 "poses": len(motion.q),
@@ -157,7 +157,7 @@ class ToolPart(ChangePart):
         return {"motions": motions, "by_joint": dict(self.found.by_joint)}
 
 
-def _joints(motion: ToolMotion, joints: Any) -> str:
+def _joints(motion: ToolMotion, joints: Sequence[NamedJoint]) -> str:
     """Return the joint values of the worst pose."""
     worst = motion.q[motion.position.argmax()]
     factors_and_units = (JOINT[joint.kind] for joint in joints)

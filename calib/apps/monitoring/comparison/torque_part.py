@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -126,7 +126,7 @@ class TorquePart(ChangePart):
             panels.append(Panel(lines, f"{name} [{self.unit}]", "time [s]", xlim=(change.t[0], change.t[-1])))
         return {"torque": Chart(panels, 0.7 + 0.95 * -(-len(panels) // 2), 2, title=change.where, shared="x")}
 
-    def numbers(self) -> dict[str, Any]:
+    def numbers(self) -> dict[str, object]:
         torques = {
             one.where: {
                 "rms": one.rms,
