@@ -205,7 +205,7 @@ def inherited(table: Mapping[str, Any], kind: type) -> ParsedTable:
         return dict(table)
     common = {key: table[key] for key in _keys(kind) if key in table}
 
-    def filled(file_table: object) -> Any:
+    def filled(file_table: object) -> object:
         if not isinstance(file_table, Mapping):
             return file_table
         result = {**common, **file_table}
@@ -301,7 +301,7 @@ def located(loc: Sequence[int | str], table: object = None) -> str:
     return result
 
 
-def _content(table: Any, key: Any) -> Any:
+def _content(table: object, key: int | str) -> object:
     """Return the value under a key of a table or at an index of a list; None where there is none."""
     if isinstance(table, Mapping):
         return table.get(key)
