@@ -5,7 +5,7 @@ from calib.api.kinematic import GeometryFit, Several, fit_geometry
 from calib.api.rendering import ChartedResult, Judged, Progress, Shown, Unjudged, saved
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.metrics import UnseenReport
-from calib.procedure.export.delivery import fit_verdicts, prediction
+from calib.procedure.export.delivery import prediction
 from calib.procedure.export.geometry import read as read_exported
 from calib.procedure.export.geometry import results as geometry_results
 from calib.procedure.findings import LEVELS, Verdict, limit, lines_of, notes_of, sentence, settle
@@ -53,7 +53,6 @@ __all__ = [
     "Verdict",
     "drawn",
     "fit_geometry",
-    "fit_verdicts",
     "geometry_results",
     "joints_of",
     "limit",
