@@ -8,7 +8,7 @@ from calib.procedure.dynamic_stage.metrics import UnseenReport
 from calib.procedure.export.delivery import fit_verdicts, prediction
 from calib.procedure.export.geometry import read as read_exported
 from calib.procedure.export.geometry import results as geometry_results
-from calib.procedure.findings import LEVELS, Verdict, limit, lines_of, sentence, settle
+from calib.procedure.findings import LEVELS, Note, Verdict, as_notes, limit, lines_of, notes_of, sentence, settle
 from calib.procedure.kinematic_stage.folder import IN_SESSION, URDF, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.procedure.kinematic_stage.inputs import read_file as read_measured_file
@@ -31,17 +31,20 @@ __all__ = [
     "GeometryFit",
     "IdentificationFolder",
     "Judged",
+    "Note",
     "Tolerance",
     "UnseenReport",
     "ValidationFolder",
     "ValidationMetrics",
     "Verdict",
+    "as_notes",
     "fit_verdicts",
     "geometry_results",
     "joints_of",
     "limit",
     "lines_of",
     "load_robot",
+    "notes_of",
     "prediction",
     "read_covariance",
     "read_exported",
