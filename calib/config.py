@@ -193,7 +193,7 @@ def _for_toml(json_schema: object) -> Any:
     return result
 
 
-def inherited(table: Mapping[str, Any], kind: type) -> dict[str, object]:
+def inherited(table: Mapping[str, Any], kind: type) -> ParsedTable:
     """Return a file's table whose ``[files.NAME]`` tables inherit missing keys from the table for all files.
 
     Args:
@@ -389,7 +389,7 @@ def _type_at(kind: Any, loc: Sequence[int | str]) -> Any:
     """Return the dataclass that describes the table at a location."""
     for part in loc:
         if is_dataclass(kind):
-            kind = get_type_hints(kind)[part]
+            kind = get_type_hints(kind)[str(part)]
         else:
             # The values of a mapping, the items of a list.
             kind = get_args(kind)[-1 if isinstance(part, str) else 0]

@@ -15,7 +15,7 @@ from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.identification.closed_loop.controllers import Reference, pd
 from calib.identification.closed_loop.simulation import Plant
-from calib.identification.loop import Controller
+from calib.identification.loop import LoopController
 from calib.records import shaped
 from calib.robot import description, library
 
@@ -188,7 +188,7 @@ def plant(name: str, coupled: bool = False, offset: np.ndarray | None = None) ->
     return Plant(bodies_of(chain), tuple(terms), parameters)
 
 
-def controller(name: str) -> Controller:
+def controller(name: str) -> LoopController:
     """Return the published PD controller of the TX40 or RV-2SQ."""
     gains = truth(name)["control"]
     limit = np.array(gains.get("limit", np.inf))

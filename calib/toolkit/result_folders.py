@@ -2,7 +2,7 @@
 
 from calib.api.dynamic import DynamicsModel
 from calib.api.kinematic import GeometryFit
-from calib.api.rendering import Drawn, Judged, saved
+from calib.api.rendering import ChartedResult, Judged, Unjudged, saved
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.metrics import UnseenReport
 from calib.procedure.export.delivery import fit_verdicts, prediction
@@ -16,28 +16,42 @@ from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics, Va
 from calib.procedure.kinematic_stage.settings import FitSettings, Tolerance
 from calib.procedure.kinematic_stage.tables import read_covariance
 from calib.procedure.robot_kinds import joints_of, stage_of
+from calib.results.registry import drawn, open_result
+from calib.results.result import Result, StoredResult
+from calib.results.scene import Drawn as DrawnRobot
+from calib.results.scene import ErrorSizes, Measured, Played, Scene, Torques, skeleton, strips, thinned
 
 __all__ = [
     "IN_SESSION",
     "LEVELS",
     "URDF",
     "VALIDATED",
+    "ChartedResult",
     "ComparedRows",
-    "Drawn",
+    "DrawnRobot",
     "DynamicsModel",
+    "ErrorSizes",
     "FitFolder",
     "FitMetrics",
     "FitSettings",
     "GeometryFit",
     "IdentificationFolder",
     "Judged",
+    "Measured",
     "Note",
+    "Played",
+    "Result",
+    "Scene",
+    "StoredResult",
     "Tolerance",
+    "Torques",
+    "Unjudged",
     "UnseenReport",
     "ValidationFolder",
     "ValidationMetrics",
     "Verdict",
     "as_notes",
+    "drawn",
     "fit_verdicts",
     "geometry_results",
     "joints_of",
@@ -45,6 +59,7 @@ __all__ = [
     "lines_of",
     "load_robot",
     "notes_of",
+    "open_result",
     "prediction",
     "read_covariance",
     "read_exported",
@@ -52,5 +67,8 @@ __all__ = [
     "saved",
     "sentence",
     "settle",
+    "skeleton",
     "stage_of",
+    "strips",
+    "thinned",
 ]

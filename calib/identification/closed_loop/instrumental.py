@@ -272,9 +272,7 @@ def identify_instrumental(
         raise CannotSimulate(str(error), error.last) from error
     # of the last step, and how often it was halved afterwards
     start, returns = plant, 0
-    round_count = 0
-    while True:
-        round_count += 1
+    for _ in range(limit):
         estimate = _estimate_round(task, runs, std, tau)
         task = task.after(estimate)
         residual_std = estimate.fit.estimate.residual_std

@@ -28,7 +28,7 @@ from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, Selectio
 from calib.procedure.measuring import prediction as forecast
 from calib.procedure.measuring.pose_limits import Limits, read_limits
 from calib.procedure.measuring.prediction import Prediction, SelectionPrediction
-from calib.procedure.measuring.run import Drivable, Exchange, Run, RunSettings, drivable
+from calib.procedure.measuring.run import Drivable, Exchange, MeasuringRun, RunSettings, drivable
 from calib.procedure.measuring.run import lines as run_lines
 from calib.procedure.robot_kinds import joints_of
 from calib.robot.calibrated import CalibratedChain
@@ -89,7 +89,7 @@ class Chosen:
     unchecked: tuple[str, ...]
     notes: tuple[str, ...]
     outlook: PoseOutlook
-    run: Run
+    run: MeasuringRun
     driven: RunSettings
     by_images: bool
 
@@ -101,7 +101,7 @@ class Chosen:
         return self.outlook.poses
 
     @property
-    def figures(self) -> tuple[str, ...]:
+    def figure_names(self) -> tuple[str, ...]:
         """Names of the available figures; none if a parameter is not identifiable."""
         if self.prediction is None:
             return ()
@@ -313,7 +313,7 @@ def beside_poses(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[s
         paths["prediction"] = forecast.beside(out)
     figures = ()
     if plots:
-        figures = FIGURES if chosen is None else chosen.figures
+        figures = FIGURES if chosen is None else chosen.figure_names
     for name in figures:
         paths[name] = out.parent / f"{out.stem}_{name}.png"
     return paths

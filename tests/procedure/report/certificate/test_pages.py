@@ -16,21 +16,22 @@ from calib.procedure.findings import PREDICTION_ONLY
 from calib.procedure.report import page
 from calib.procedure.report.certificate import rendering
 from calib.procedure.report.certificate.record import (  # fmt: skip
-    KNOWN,
+    CERTIFIED_SETUP,
     MAX_LINES,
     MAX_PAGES,
     NO_DETAILS,
     Certificate,
     Entry,
-    Stage,
+    Judgement,
+    StageRecord,
     records,
     report,
 )
-from calib.procedure.report.page import KeyFigure, Picture, Pictures, Section, Table, Text
+from calib.procedure.report.page import KeyFigure, Picture, Pictures, ReportTable, Section, Text
 
 HOSTILE = "[bold]<script>alert(1)</script> & \"quoted\" 'one'[/]"
 ROWS = [(HOSTILE,), ("nominal", "1.5"), ("calibrated", "0.25")]
-TABLE = Table("Errors", ("arm", "rms"), ROWS, "how to read", frozenset({2}), (1,))
+TABLE = ReportTable("Errors", ("arm", "rms"), ROWS, "how to read", frozenset({2}), (1,))
 
 
 class Reader(HTMLParser):
@@ -77,7 +78,7 @@ def judged(verdict: str = "pass", reason: str = "rms 0.1 mm", blocks=()) -> Sect
 
 
 def certificate_of(*sections: Section, details=NO_DETAILS, known=ROBOT, alert="", files=(), findings=()) -> Certificate:
-    stages = [Stage(one, one.blocks, (), findings) for one in sections]
+    stages = [StageRecord(one, one.blocks, (), findings) for one in sections]
     return records("Calibration of x", "Geometry", known, stages, ["obstacles"], files, details, alert)[0]
 
 
@@ -93,13 +94,13 @@ def said(value: object) -> list[str]:
         return [re.sub(r"[\s\u200b]", "", value)]
     if isinstance(value, Picture):
         return said(value.caption)
-    if isinstance(value, Table | Text | Pictures | Section | Certificate) or hasattr(value, "label"):
+    if isinstance(value, Judgement):
+        return said([value.title, value.label, value.reason])
+    if isinstance(value, ReportTable | Text | Pictures | Section | Certificate) or hasattr(value, "label"):
         hidden = {"kind", "strong", "numbers", "figures", "verdict", "reason"}
         if not isinstance(value, Certificate) and hasattr(value, "kind") and not len(value):  # type: ignore[arg-type]
             return []
         return [text for name, one in vars(value).items() if name not in hidden for text in said(one)]
-    if hasattr(value, "word"):
-        return said([value.title, value.word, value.reason])  # type: ignore[attr-defined]
     return [text for one in value for text in said(one)] if isinstance(value, list | tuple) else []
 
 
@@ -119,7 +120,7 @@ def test_every_text_is_escaped_for_all():
     blocks = [TABLE, Text(HOSTILE, [HOSTILE]), Pictures(HOSTILE, [Picture(SVG, HOSTILE)])]
     section = Section(HOSTILE, blocks, "fail", HOSTILE, [KeyFigure(*[HOSTILE] * 7)])
     entries, files = [Entry(HOSTILE, HOSTILE)], [(HOSTILE, HOSTILE, "1", HOSTILE)]
-    details, stages = CertificateSection(*[HOSTILE] * 12), [Stage(section, blocks, [HOSTILE], [HOSTILE])]
+    details, stages = CertificateSection(*[HOSTILE] * 12), [StageRecord(section, blocks, [HOSTILE], [HOSTILE])]
     one, whole = records(HOSTILE, HOSTILE, entries, stages, [HOSTILE], files, details, HOSTILE)
     assert "<script>" not in rendering.html(whole) + rendering.html(one)
     assert HOSTILE in printed(Text("", [HOSTILE])) and HOSTILE in printed(TABLE)
@@ -146,7 +147,7 @@ def test_pdf_and_html_say_what_the_record_says(verdict):
     assert [text for text in expected if text not in in_document and text.upper() not in in_document] == []
     assert not notes and "None" not in on_page
     word = "PASS (prediction only)" if verdict == PREDICTION_ONLY else verdict.upper()
-    assert one.verdicts[0].word == word
+    assert one.verdicts[0].label == word
 
 
 def test_the_report_has_a_table_of_contents_and_all_of_it():
@@ -176,7 +177,7 @@ def test_paths_of_this_machine_stay_in_the_report():
         judged(blocks=[Text("Findings", [line])]), known=[Entry("description", "/home/someone/robot.urdf")]
     )
     assert one.sections[0].blocks[0].lines == ["validation.csv: 5 rows; see ~/notes.txt, 3-measured/a.csv and m/s"]
-    assert one.known == [Entry("description", "robot.urdf")]
+    assert one.setup == [Entry("description", "robot.urdf")]
 
 
 @pytest.mark.parametrize("entry", ["", "W" * MAX_LETTERS, "🤖 漢字 " * 28, "مستشعر الليزر " * 14, "שלום-SN-123 " * 16])
@@ -184,11 +185,11 @@ def test_any_entries_leave_at_most_four_pages(entry):
     """Everything at its bound: empty, long without a blank, emoji, Chinese, right to left."""
     details = CertificateSection(*[entry[:MAX_LETTERS].strip()] * 12)
     rows = [(f"joint{k}", *["1.234 N m"] * 6) for k in range(14)]
-    table = Table("Torque errors", tuple("abcdefg"), rows, "n" * 300, numbers=range(1, 7))
+    table = ReportTable("Torque errors", tuple("abcdefg"), rows, "n" * 300, numbers=range(1, 7))
     text, pictures = Text("Findings", ["f " * 200] * 30), Pictures("", [Picture(SVG, "c" * 200, True)] * 2)
     sections = [replace(judged(reason="r " * 400, blocks=[table, pictures, text]), title=name) for name in ("A", "B")]
     sections = [replace(one, figures=[*one.figures] * 8) for one in sections]
-    known = [Entry(label, entry or "value") for label in KNOWN]
+    known = [Entry(label, entry or "value") for label in CERTIFIED_SETUP]
     lines = ["f " * 200] * 30
     one = certificate_of(*sections, details=details, known=known, files=FILES, findings=lines, alert="a" * 200)
     document, _ = rendering.pdf(one)
