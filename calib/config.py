@@ -14,7 +14,7 @@ from dataclasses import fields, is_dataclass
 from functools import cache
 from inspect import cleandoc
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
 from calib.config_types import UNKNOWN, Hidden, OneOf, ParsedTable, shown
 from calib.errors import CalibError, UsageError, suggestion
@@ -193,7 +193,7 @@ def _for_toml(json_schema: object) -> Any:
     return result
 
 
-def inherited(table: Mapping[str, Any], kind: type) -> dict[str, object]:
+def inherited(table: Mapping[str, Any], kind: type) -> ParsedTable:
     """Return a file's table whose ``[files.NAME]`` tables inherit missing keys from the table for all files.
 
     Args:
@@ -205,7 +205,7 @@ def inherited(table: Mapping[str, Any], kind: type) -> dict[str, object]:
         return dict(table)
     common = {key: table[key] for key in _keys(kind) if key in table}
 
-    def filled(file_table: object) -> Any:
+    def filled(file_table: object) -> object:
         if not isinstance(file_table, Mapping):
             return file_table
         result = {**common, **file_table}
@@ -234,7 +234,7 @@ def described(source: object) -> dict[str, str]:
         descriptions |= _entries(base.__doc__ or "")
     for name, text in descriptions.items():
         if OTHERS in text:
-            descriptions[name] = text.replace(OTHERS, ", ".join(_others(source, name)))
+            descriptions[name] = text.replace(OTHERS, ", ".join(_others(cast(type, source), name)))
     return descriptions
 
 
@@ -301,7 +301,7 @@ def located(loc: Sequence[int | str], table: object = None) -> str:
     return result
 
 
-def _content(table: Any, key: Any) -> Any:
+def _content(table: object, key: int | str) -> object:
     """Return the value under a key of a table or at an index of a list; None where there is none."""
     if isinstance(table, Mapping):
         return table.get(key)
@@ -389,7 +389,7 @@ def _type_at(kind: Any, loc: Sequence[int | str]) -> Any:
     """Return the dataclass that describes the table at a location."""
     for part in loc:
         if is_dataclass(kind):
-            kind = get_type_hints(kind)[part]
+            kind = get_type_hints(kind)[str(part)]
         else:
             # The values of a mapping, the items of a list.
             kind = get_args(kind)[-1 if isinstance(part, str) else 0]

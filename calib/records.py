@@ -19,7 +19,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, TypeVar, get_args, get_type_hints
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from pydantic_core import CoreSchema
 
 T = TypeVar("T")
+FieldValues: TypeAlias = dict[str, Any]
+"""Values of fields of a record by name, to be passed on as keywords."""
 # What a spreadsheet's formula begins with, and our own mark.
 _FORMULA = ("=", "+", "-", "@", "\t", "\r", "'")
 
@@ -45,7 +47,7 @@ def shielded(text: str) -> str:
     return text if text[:1] not in _FORMULA or is_number(text) else f"'{text}"
 
 
-def field_values(record: DataclassInstance) -> dict[str, Any]:
+def field_values(record: DataclassInstance) -> FieldValues:
     """Return the values of a dataclass's fields by name, as they are: for a record of a class that has more fields."""
     return {field.name: getattr(record, field.name) for field in fields(record) if field.init}
 
@@ -238,7 +240,7 @@ def read_only(values: np.ndarray) -> np.ndarray:
     return values
 
 
-def as_subclass(record: DataclassInstance, kind: type[T]) -> T:
+def as_subclass(record: Any, kind: type[T]) -> T:
     """Return a record as an instance of a subclass of its type that adds methods, but no fields."""
     if not issubclass(kind, type(record)):
         raise TypeError(f"{kind.__name__} is no subclass of {type(record).__name__}")

@@ -255,7 +255,7 @@ def finding_list() -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _finding(name: str, one: findings.Entry) -> str:
+def _finding(name: str, one: findings.CatalogueEntry) -> str:
     rows = [
         ("Says", cell(findings.in_words(one.says))),
         ("Level", cell(findings.levels(one))),

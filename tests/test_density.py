@@ -24,6 +24,7 @@ REMEDIES = {
     "nested_per_100_statements": "split the statements that hold three or more comprehensions or conditionals",
     "empty_names_percent": "name variables by what they hold, by none of EMPTY_WORDS in tests/support/code_density.py",
     "fmt_skip": "let the formatter decide",
+    "any_annotations": "say the type: object, a Protocol, a TypeVar, or an alias such as config_types.ParsedTable",
 }
 LOWER = "python tests/support/code_density.py --lower"
 
@@ -64,11 +65,11 @@ def test_packages_keep_their_token_budget():
 
 
 def test_the_measure_counts_what_it_says():
-    """Two statements of 13 and 4 tokens, a comprehension and a conditional, one of three bound names empty."""
+    """Two statements of 13 and 4 tokens, a comprehension, a conditional, one of three bound names empty, one Any."""
     text = textwrap.dedent(
         """
         '''A docstring counts nothing.'''
-        def f(own):
+        def f(own: Any):
             lengths = ["µ" if own else 2 for x in own]  # fmt: skip
             return lengths + 1
         """
@@ -79,6 +80,7 @@ def test_the_measure_counts_what_it_says():
         nested_per_100_statements=0.0,
         empty_names_percent=100 / 3,
         fmt_skip=1,
+        any_annotations=1,
     )
     assert density_of([text]) == expected
 

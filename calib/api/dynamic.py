@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from calib.api.rendering import Drawn, Judged, Progress, data_frame, listed, optional
+from calib.api.rendering import ChartedResult, DataFrame, Judged, Progress, data_frame, listed, optional
 from calib.arguments import checked
 from calib.data.recordings.recording import Recording
 from calib.errors import UsageError, require
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 Recorded = str | Path | Recording
 
 
-class DynamicsModel(Drawn, Judged, identify.IdentificationOutcome):
+class DynamicsModel(ChartedResult, Judged, identify.IdentificationOutcome):
     """Identified dynamics with covariance and verdict. ``print`` shows errors on other motion, friction and verdict."""
 
     kind = BY_NAME["identification"]
@@ -44,7 +44,7 @@ class DynamicsModel(Drawn, Judged, identify.IdentificationOutcome):
     )
 
     @property
-    def residuals(self) -> Any:
+    def residuals(self) -> DataFrame:
         """Measured minus predicted torques of every recording, fitted or unseen, as a pandas DataFrame."""
         titles = self.found.settings.torque_rows.titles(self.inputs.chain.joint_names)
         header = ["file", "t [s]"]
@@ -205,7 +205,7 @@ def identify_dynamics(
             progress=progress,
         )
     identification_inputs = inputs.gather(
-        cast(Any, robot),
+        cast(str | Path | CalibratedChain, robot),
         listed(recordings),
         listed(validate),
         options=options,

@@ -6,12 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 import numpy as np
 
 from calib import files
-from calib.api.rendering import Drawn, Judged, Progress, Unjudged, data_frame, listed, optional
+from calib.api.rendering import ChartedResult, Judged, Progress, Unjudged, data_frame, listed, optional
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions, read_options
@@ -39,7 +39,7 @@ Measured = str | Path | PoseMeasurements
 Several = Measured | Sequence[Measured | Sequence[Measured]]
 
 
-class PoseSelection(Drawn, Unjudged, selection.Chosen):
+class PoseSelection(ChartedResult, Unjudged, selection.Chosen):
     """Poses that determine a robot's geometry best. ``print`` shows index, bound and what random poses reach."""
 
     kind = BY_NAME["selection"]
@@ -117,7 +117,7 @@ class PredictedPoses(NamedTuple):
     sigma: np.ndarray
 
 
-class GeometryFit(Drawn, Judged, fit.Outcome):
+class GeometryFit(ChartedResult, Judged, fit.Outcome):
     """A fitted geometry with covariance and verdict. ``print`` shows the ladder, errors on unseen poses and verdict."""
 
     kind = BY_NAME["fit"]
@@ -127,7 +127,7 @@ class GeometryFit(Drawn, Judged, fit.Outcome):
     )
 
     @property
-    def residuals(self) -> Any:
+    def residuals(self) -> DataFrame:
         """Residuals of every row, fitted or unseen, with weight and expected error, as a pandas DataFrame."""
         from calib.procedure.kinematic_stage.tables import residuals
 
@@ -320,7 +320,13 @@ def fit_geometry(
     if progress is not None:
         progress("reading")
     fit_inputs = inputs.gather(
-        cast(Any, robot), listed(measured), listed(validate), options=options, settings=settings, base=base, tip=tip
+        cast(str | Path | CalibratedChain, robot),
+        listed(measured),
+        listed(validate),
+        options=options,
+        settings=settings,
+        base=base,
+        tip=tip,
     )
     if on_read is not None:
         on_read(fit_inputs)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from calib.api.dynamic import DynamicsModel
-from calib.api.rendering import Drawn, Progress, Unjudged, optional, saved
+from calib.api.rendering import ChartedResult, Progress, Unjudged, optional, saved
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.pose_lists import Targets
@@ -34,7 +34,7 @@ def _columns(track: Setpoints) -> Sampled:
     return track.times, track.q, track.v, track.a
 
 
-class ExcitationDesign(Drawn, Unjudged, design.Designed):
+class ExcitationDesign(ChartedResult, Unjudged, design.Designed):
     """A motion that excites a robot's dynamics, verified within limits. ``print`` shows condition numbers, margins."""
 
     kind = BY_NAME["excitation"]
@@ -73,7 +73,7 @@ class ExcitationDesign(Drawn, Unjudged, design.Designed):
         return "\n".join(folder.design_lines(self))
 
 
-class MotionPlan(Drawn, Unjudged, planning.Planned):
+class MotionPlan(ChartedResult, Unjudged, planning.Planned):
     """The fastest motion through waypoints, within speeds and torques. ``print`` shows duration and margins."""
 
     kind = BY_NAME["plan"]
@@ -172,7 +172,7 @@ def design_excitation(
             )
         identify_settings = None if options is None else _read(options).settings
         designed = design.excite(
-            cast(Any, robot),
+            cast(str | Path | CalibratedChain, robot),
             settings,
             model=model_folder,
             limits=optional(limits),
@@ -229,7 +229,7 @@ def plan_motion(
                 progress=progress,
             )
         planned = planning.plan(
-            cast(Any, robot),
+            cast(str | Path | CalibratedChain, robot),
             optional(waypoints),
             settings,
             model=model_folder,

@@ -1,7 +1,7 @@
 """Reading robots and measurements from files, as inputs of the API functions."""
 
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 from calib.api.rendering import optional
 from calib.arguments import checked
@@ -35,7 +35,7 @@ def load(robot: str | Path, *, base: str | None = None, tip: str | None = None) 
         RobotError: where nothing of this kind is found, or the file is wrong: with place and advice.
     """
     if stage_of(robot, "identify", base, tip) is not None:
-        return cast(Any, mechanism(robot))
+        return cast(CalibratedChain, mechanism(robot))
     return load_calibrated(robot, base, tip)
 
 
@@ -82,7 +82,7 @@ def read_recording(
 
     parallel_robot = mechanism(robot)
     if parallel_robot is None:
-        chain = _loaded(cast(Any, robot)).chain
+        chain = _loaded(cast(str | Path | CalibratedChain, robot)).chain
     else:
         chain = parallel_robot.chain
     return read_file(path, joints_of(chain), options or RecordingOptions())

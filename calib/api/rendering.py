@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from html import escape
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, ClassVar, Self, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeAlias, overload
 
 from calib.errors import UsageError, one_of, refused_as
 from calib.procedure.findings import NOT_JUDGED, Verdict
@@ -21,7 +21,6 @@ from calib.workers.threads import one_blas_thread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from pandas import DataFrame  # pyright: ignore[reportMissingImports]
 
     from calib.data.csv_table import Table
     from calib.procedure.report.charts import Chart
@@ -29,6 +28,8 @@ if TYPE_CHECKING:
     from calib.results.scene import Scene
 
 Progress = Callable[[str], None]
+DataFrame: TypeAlias = Any
+"""A pandas DataFrame; pandas is there for those who ask for data frames."""
 # Letters of a line of text.
 WIDTH = 120
 
@@ -48,8 +49,14 @@ def optional(value: object) -> Any:
     return Path(value) if isinstance(value, str) else value
 
 
+class SavedResult(Protocol):
+    """A result that can be written to a folder."""
+
+    def save(self, out: str | Path, *, plots: bool = True) -> Path: ...
+
+
 @contextmanager
-def saved(result: object) -> Iterator[Path]:
+def saved(result: str | Path | SavedResult) -> Iterator[Path]:
     """Yield the folder of a result: a given path unchanged, or a temporary folder of a result in memory."""
     if isinstance(result, (str, Path)):
         yield Path(result)
@@ -90,7 +97,7 @@ class Kept(Shown, ABC):
     kind: ClassVar[ResultKind]
 
     @abstractmethod
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
         """Write the result's folder."""
 
     def figures(self) -> Mapping[str, Picture]:
@@ -125,7 +132,7 @@ class Unjudged(Kept):
         return Verdict(NOT_JUDGED, f"{self.kind.noun} has no verdict")
 
 
-class Drawn(Kept):
+class ChartedResult(Kept):
     """A result with figures."""
 
     def figures(self) -> Mapping[str, Picture]:
@@ -199,5 +206,5 @@ def data_frame(rows: Iterable[object], columns: Sequence[str]) -> DataFrame:
     """
     message = "data frames need pandas: pip install 'armature-calib[pandas]'; to_dict() and save() do without"
     with refused_as(UsageError, ImportError, message):
-        from pandas import DataFrame  # pyright: ignore[reportMissingImports]
-    return DataFrame(list(rows), columns=list(columns))
+        import pandas  # pyright: ignore[reportMissingImports]
+    return pandas.DataFrame(list(rows), columns=list(columns))

@@ -17,7 +17,7 @@ from typer.main import get_command
 
 import calib
 from calib.cli import dynamics, geometry, session
-from calib.cli.help import Group, spelt
+from calib.cli.help import CommandGroup, spelt
 from calib.extensions import Point
 from calib.workers.threads import limit_process
 
@@ -40,7 +40,7 @@ INTERRUPTED_CODE = 130
 BROKEN_PIPE_CODE = 141
 
 app = typer.Typer(
-    cls=Group,
+    cls=CommandGroup,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # a unit in brackets is a unit, not a style

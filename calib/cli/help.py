@@ -38,7 +38,7 @@ def type_word(kind: object, choices: tuple[str, ...] | str = ()) -> str | None:
 class _Spelt(_ClickCommand):
     """Help in letters that the console has, which Typer would write as UTF-8 all the same."""
 
-    def get_help(self, ctx: object) -> str:
+    def get_help(self, ctx: Any) -> str:
         console = sys.stdout.encoding or "utf-8"
         return super().get_help(ctx).encode(console, "spelt").decode(console)
 
@@ -46,10 +46,10 @@ class _Spelt(_ClickCommand):
 class Command(_Spelt, TyperCommand):
     """A command whose help names arguments as its text does (ROBOT, MEASURED...), without Python's types."""
 
-    def collect_usage_pieces(self, ctx: object) -> list[str]:
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
         return [piece.replace("{", "").replace("}", "") for piece in super().collect_usage_pieces(ctx)]
 
-    def format_options(self, ctx: object, formatter: object) -> None:
+    def format_options(self, ctx: Any, formatter: Any) -> None:
         for title, kind in (("Arguments", "argument"), ("Options", "option")):
             rows = []
             for parameter in self.get_params(ctx):
@@ -62,10 +62,10 @@ class Command(_Spelt, TyperCommand):
                     formatter.write_dl(rows, col_max=min(MAX_COLUMN, formatter.width // 3))
 
 
-class Group(_Spelt, TyperGroup):
+class CommandGroup(_Spelt, TyperGroup):
     """The list of commands in `GROUPS`, each stated where the command is (`calib.cli.shared.command`)."""
 
-    def format_commands(self, ctx: object, formatter: object) -> None:
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
         groups: dict[str, list[tuple[str, str]]] = {title: [] for title in GROUPS}
         for name, command in self.commands.items():
             group = str(command.rich_help_panel)  # type: ignore[attr-defined]
@@ -75,7 +75,7 @@ class Group(_Spelt, TyperGroup):
                 formatter.write_dl(rows)
 
 
-def spelt(error: object) -> tuple[str, int]:
+def spelt(error: Any) -> tuple[str, int]:
     """Return letters that an encoding lacks in ASCII (sigma, ^2, ...), or by their number; see `codecs`."""
     letters = error.object[error.start : error.end]
     return "".join(map(_in_ascii, letters)), error.end

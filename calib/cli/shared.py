@@ -17,7 +17,7 @@ from inspect import Parameter, cleandoc, signature
 from math import inf, isfinite
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import TYPE_CHECKING, Annotated, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import typer
 from typer.models import ArgumentInfo, OptionInfo, ParameterInfo
@@ -270,7 +270,11 @@ def command(app: typer.Typer, group: str, name: str | None = None, listing: bool
         hints = get_type_hints(function, include_extras=True)
         descriptions = described(Common) | described(function)
         parameters = signature(function).parameters
-        settings = {key: hint for key, hint in hints.items() if key in parameters and is_dataclass(hint)}
+        settings = {
+            key: hint
+            for key, hint in hints.items()
+            if key in parameters and isinstance(hint, type) and is_dataclass(hint)
+        }
         options: list[Parameter] = []
         for key, parameter in parameters.items():
             if key in settings:
@@ -289,7 +293,7 @@ def command(app: typer.Typer, group: str, name: str | None = None, listing: bool
         def call(**values: object) -> object:
             try:
                 arguments = {key: _built(kind, values) for key, kind in settings.items()}
-                with printing(values.get("verbose", True)):
+                with printing(bool(values.get("verbose", True))):
                     arguments |= {key: value for key, value in values.items() if key in parameters}
                     return function(**arguments)
             except UsageError as error:
@@ -380,7 +384,7 @@ def _as_typed(message: str, options: Sequence[Parameter]) -> str:
     return message
 
 
-def _plain(hint: object) -> tuple[object, tuple[object, ...]]:
+def _plain(hint: Any) -> tuple[Any, tuple[object, ...]]:
     """Return a type without None, and its metadata."""
     if get_origin(hint) is Annotated:
         plain, metadata = _plain(get_args(hint)[0])
@@ -423,7 +427,7 @@ def _chosen(kind: type, values: dict[str, object]) -> dict[str, object]:
     return result
 
 
-def _read(hint: object, value: object) -> object:
+def _read(hint: object, value: Any) -> object:
     """Return a value as in an option file: comma-separated texts as lists, numbers with their unit."""
     plain, metadata = _plain(hint)
     unit = _typed(metadata).unit

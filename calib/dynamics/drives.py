@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.dynamics.shapes import SHAPES, STEPS, V0, Joined, JointRange, Shape
+from calib.dynamics.shapes import SHAPES, STEPS, V0, RecordedRange, Shape, TermMotion
 from calib.errors import CalibError, one_of, require
 
 Motion = tuple[tuple[int, float], ...]
@@ -87,7 +87,7 @@ class DriveTerm:
             state = states[k] if self.form.remembers else None
             yield row, self.values(_join(self, motion, motions, state))
 
-    def values(self, joined: Joined) -> np.ndarray:
+    def values(self, joined: TermMotion) -> np.ndarray:
         """Return the term's column (N,) for a motion, per unit of the parameter."""
         if self.shape == "acceleration":
             return joined.a
@@ -98,12 +98,12 @@ class DriveTerm:
             return values * np.abs(joined.load)
         return values
 
-    def slopes(self, joined: Joined) -> tuple[np.ndarray, np.ndarray, float]:
+    def slopes(self, joined: TermMotion) -> tuple[np.ndarray, np.ndarray, float]:
         """Return the derivatives of the column with respect to position and velocity (N,), and to acceleration."""
         _, by_x, by_v = self._evaluated(joined, 3)
         return by_x, by_v, float(self.shape == "acceleration")
 
-    def _evaluated(self, joined: Joined, rows: int) -> np.ndarray:
+    def _evaluated(self, joined: TermMotion, rows: int) -> np.ndarray:
         """Return the value (1, N), or the value with its derivatives with respect to position and velocity (3, N)."""
         from calib.dynamics import shape_kernels
 
@@ -250,13 +250,15 @@ def friction_states(terms: Sequence[DriveTerm], q: np.ndarray) -> np.ndarray:
     return np.array(states).reshape(len(states), count)
 
 
-def _join(term: DriveTerm, motion: Motion, motions: Sequence[np.ndarray | None], state: np.ndarray | None) -> Joined:
+def _join(
+    term: DriveTerm, motion: Motion, motions: Sequence[np.ndarray | None], state: np.ndarray | None
+) -> TermMotion:
     """Return the motion of a term: weighted sums of q, v, a and load."""
     if term.form.loaded and motions[3] is None:
         raise CalibError(f"term '{term.name}' needs the transmitted torque; give load (N, n), measured or predicted")
     q, v, a, load = motions
     assert q is not None and v is not None and a is not None
-    return Joined(
+    return TermMotion(
         x=_weighted(motion, q),
         v=_weighted(motion, v),
         a=_weighted(motion, a),
@@ -277,7 +279,7 @@ def _weighted(motion: Motion, series: np.ndarray) -> np.ndarray:
     return total
 
 
-def offered(step: str, joint: int, joint_range: JointRange, linear: bool = False) -> tuple[DriveTerm, ...]:
+def offered(step: str, joint: int, joint_range: RecordedRange, linear: bool = False) -> tuple[DriveTerm, ...]:
     """Return the candidate terms of one joint in a step of the friction ladder, scaled by the joint's motion."""
     numbered = []
     for offer in STEPS[step]:

@@ -30,7 +30,7 @@ STRIBECK_SHARES = {"": 0.05, ".2": 0.2}
 
 
 @dataclass(frozen=True)
-class Joined:
+class TermMotion:
     """Motion of one term, each (N,); `load` [N m or N] and `state` are None if not needed."""
 
     x: np.ndarray
@@ -41,7 +41,7 @@ class Joined:
 
 
 @dataclass(frozen=True)
-class JointRange:
+class RecordedRange:
     """Ranges of a joint's recorded motion, which scale its terms.
 
     Attributes:
@@ -64,7 +64,7 @@ class Shape:
         unit: of the parameter for a revolute joint, and `unit_linear` for a prismatic one.
         settings: names of the numbers it needs, with units; ``v0`` smooths Coulomb's sign.
         slopes: whether it has derivatives (none if it depends on past motion or torques).
-        loaded, remembers: whether it needs `Joined.load`, `Joined.state`.
+        loaded, remembers: whether it needs `TermMotion.load`, `TermMotion.state`.
         friction: whether it depends on speed; else a motion along a path is affine in it.
         dissipative: whether it is friction, which dissipates energy for a positive parameter.
         of_velocity: whether it is a function of v alone (a constant is one).
@@ -118,36 +118,36 @@ class Offer(NamedTuple):
 
     label: str
     shape: str
-    settings: Callable[[JointRange], Mapping[str, tuple[float, ...]]]
+    settings: Callable[[RecordedRange], Mapping[str, tuple[float, ...]]]
     side: str = "motor"
 
 
-def _presliding(joint: JointRange) -> dict[str, tuple[float, ...]]:
+def _presliding(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
     """Return candidate stop operators of several widths, each z - sign(v), so that Fc stays the friction of sliding."""
     return {f".{k}": (share * joint.travel, joint.v0) for k, share in enumerate(PRESLIDING_SHARES, 1)}
 
 
-def _cable(joint: JointRange) -> dict[str, tuple[float, ...]]:
+def _cable(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
     """Return candidate harmonics of period 2 · travel, which represent any smooth torque of cables and hoses."""
     return {f".{k}": (k * math.pi / joint.travel, math.inf) for k in CABLE_HARMONICS}
 
 
-def _stribeck(joint: JointRange) -> dict[str, tuple[float, ...]]:
+def _stribeck(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
     """Return candidate Stribeck torques of two speeds."""
     return {end: (share * joint.peak, 1.0, joint.v0) for end, share in STRIBECK_SHARES.items()}
 
 
-def _smoothed(joint: JointRange) -> dict[str, tuple[float, ...]]:
+def _smoothed(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
     """Return one candidate with a smoothed sign."""
     return {"": (joint.v0,)}
 
 
-def _up_to_edge(joint: JointRange) -> dict[str, tuple[float, ...]]:
+def _up_to_edge(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
     """Return one candidate that keeps its value beyond the fastest speed."""
     return {"": (joint.edge,)}
 
 
-def _root(joint: JointRange) -> dict[str, tuple[float, ...]]:
+def _root(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
     """Return one candidate that keeps its value beyond the fastest speed, smoothed at rest."""
     return {"": (joint.edge, joint.v0)}
 

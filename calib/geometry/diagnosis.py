@@ -26,7 +26,7 @@ from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, layout, observe, positions, prepare
-from calib.geometry.residuals import Part
+from calib.geometry.residuals import ResidualPart
 from calib.geometry.weighing import GeometricFit, Settings
 from calib.records import evenly
 from calib.robot.chain import Chain, element_length
@@ -71,13 +71,13 @@ def diagnose(fit: GeometricFit, with_changes: bool = True) -> list[Finding]:
     return findings
 
 
-def _lengths(fit: GeometricFit) -> list[tuple[Block, Part]]:
+def _lengths(fit: GeometricFit) -> list[tuple[Block, ResidualPart]]:
     """Return each block with its first residual part, which is in metres for every kind of measurement."""
     first = {piece.block: piece.part.per_row() for piece in reversed(fit.pieces)}
     return [(block, first[number]) for number, block in enumerate(fit.blocks)]
 
 
-def _setup_change(block: Block, part: Part) -> list[Finding]:
+def _setup_change(block: Block, part: ResidualPart) -> list[Finding]:
     """Return a finding if the set-up changed: the residuals before and after one row differ in size and rank."""
     size = np.linalg.norm(part.value, axis=0)
     # a few gross rows are not a set-up
@@ -111,7 +111,7 @@ def _setup_change(block: Block, part: Part) -> list[Finding]:
     return [finding("set-up-changed", file=_name(block), first=first, last=last, worse=worse, rest=better)]
 
 
-def _systematic(block: Block, part: Part) -> list[Finding]:
+def _systematic(block: Block, part: ResidualPart) -> list[Finding]:
     """Return findings on systematic residuals: noise differs between neighbouring poses, a missing effect does not."""
     findings = []
     name = _name(block)
@@ -137,7 +137,7 @@ def _name(block: Block) -> str:
     return Path(block.measured.file).name or "measurements"
 
 
-def neighbour_floor(q: np.ndarray, part: Part) -> float | None:
+def neighbour_floor(q: np.ndarray, part: ResidualPart) -> float | None:
     """Return the rms of residual differences between nearest neighbours in q, over √2 [m]: an estimate of the noise.
 
     (von Neumann's mean square successive difference, 1941, with neighbours in joint space in place of time.) None where

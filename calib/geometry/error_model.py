@@ -29,7 +29,7 @@ from calib.geometry.model_choice.cross_validation import project_out, term_group
 from calib.geometry.model_choice.folds import Folds, random_folds
 from calib.geometry.model_choice.ladder import MAX_RESIDUAL, ModelSelection
 from calib.geometry.observation import layout, observe, prepare
-from calib.geometry.residuals import Part
+from calib.geometry.residuals import ResidualPart
 from calib.geometry.weighing import GeometricFit
 from calib.records import evenly
 from calib.robot.calibrated import Deflection
@@ -192,7 +192,7 @@ def _widened(distance: np.ndarray, width: float, factor: float) -> np.ndarray:
     return 1.0 + (factor - 1.0) * share
 
 
-def _position_part(parts: Sequence[Part]) -> Part:
+def _position_part(parts: Sequence[ResidualPart]) -> ResidualPart:
     return next(part for part in parts if part.label == "position")
 
 

@@ -15,7 +15,7 @@ from calib.data.poses.measurements import PoseMeasurements, Positions
 from calib.estimation.relevance import Gram
 from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, layout_counts, observe, pieces, predict, rows_of, target_jacobian
-from calib.geometry.residuals import Part
+from calib.geometry.residuals import ResidualPart
 from calib.robot.calibrated import target_elements
 
 # corrections of one element from which on it pays to multiply elements first (our choice)
@@ -31,7 +31,7 @@ def separable(measured: PoseMeasurements) -> bool:
 
 def row_statistics(
     cell: Installation, block: Block, free: np.ndarray, scales: Iterable[np.ndarray]
-) -> Iterator[tuple[Part, Gram]]:
+) -> Iterator[tuple[ResidualPart, Gram]]:
     """Yield the residual parts of a `separable` block, piece by piece, with their rows' statistics.
 
     Args:

@@ -274,7 +274,7 @@ class Observation:
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
+class TargetPose:
     """Pose of a target in the arm's base: q (m, n) -> rotation (m, 3, 3), position (m, 3) [m]."""
 
     cell: Installation

@@ -17,7 +17,7 @@ from calib.data.poses.measurements import PoseMeasurements, Positions, take
 from calib.errors import UsageError, require
 from calib.estimation.nonlinear import Rows
 from calib.geometry.installation import FRAME_AXES, Installation, Seen, see
-from calib.geometry.residuals import CommonNoise, Part, joined, parts
+from calib.geometry.residuals import CommonNoise, ResidualPart, joined, parts
 from calib.robot.calibrated import evaluate, extra_displacements, target_elements
 from calib.robot.kinematics import element_jacobian
 from calib.transforms import displace
@@ -264,7 +264,7 @@ def predict(cell: Installation, block: Block) -> Seen:
     return see(cell, block.measured.q, block.station, block.tool, block.bases, block.displacements)
 
 
-def observe(cell: Installation, block: Block, free: np.ndarray) -> list[Part]:
+def observe(cell: Installation, block: Block, free: np.ndarray) -> list[ResidualPart]:
     """Return the residual parts of a block with their Jacobian with respect to the parameters `free` (f,)."""
     observed = [_observe(cell, piece, free) for piece in pieces(cell, block)]
     if len(observed) == 1:
@@ -272,7 +272,7 @@ def observe(cell: Installation, block: Block, free: np.ndarray) -> list[Part]:
     return [joined(parts_of_pieces) for parts_of_pieces in zip(*observed)]
 
 
-def _observe(cell: Installation, block: Block, free: np.ndarray) -> list[Part]:
+def _observe(cell: Installation, block: Block, free: np.ndarray) -> list[ResidualPart]:
     seen = predict(cell, block)
     if len(cell.optics):
         first_of_optics = sum(layout_counts(cell)[:3])

@@ -172,7 +172,7 @@ def spread(points: np.ndarray) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Command:
+class CommandedPose:
     """Pose that an arm's model predicts for the mean joints of repeated rows.
 
     Attributes:
@@ -194,14 +194,16 @@ class Command:
         return _numbers(np.degrees(self.base.T @ (mean * self.rotation.inv()).as_rotvec()))
 
 
-def _command(cell: Installation, block: Block, rows: np.ndarray) -> Command:
+def _command(cell: Installation, block: Block, rows: np.ndarray) -> CommandedPose:
     """Return the pose that an arm predicts for some rows of a block."""
     seen = predict(cell, rows_of(cell, block, rows))
     rotations = Rotation.from_matrix(seen.rotation.transpose(2, 1, 0))
-    return Command(cell.stations[block.station][:3, :3], seen.point.mean(axis=1), rotations.mean())
+    return CommandedPose(cell.stations[block.station][:3, :3], seen.point.mean(axis=1), rotations.mean())
 
 
-def _repeated_pose(measured: Positions, rows: np.ndarray, nominal: Command, calibrated: Command) -> RepeatedPose:
+def _repeated_pose(
+    measured: Positions, rows: np.ndarray, nominal: CommandedPose, calibrated: CommandedPose
+) -> RepeatedPose:
     """Return accuracy and repeatability of one pose from its rows, given the command by both arms."""
     points = measured.position[rows]
     variation = _variation(points, _directions(measured, rows))

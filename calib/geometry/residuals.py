@@ -28,6 +28,11 @@ MIN_CHANGE = 1e-13
 class CommonNoise(Protocol):
     """Errors that several rows share, see `calib.geometry.camera.pixel_residuals.ImageNoise`."""
 
+    @property
+    def factor(self) -> float:
+        """Factor of the stated sigmas."""
+        ...
+
     def near(self, noise: Self) -> bool:
         """Return whether two estimates agree, so that the fit is not repeated."""
         ...
@@ -38,7 +43,7 @@ class CommonNoise(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class ResidualPart:
     """Residuals of one kind with their Jacobian, all in one unit.
 
     Attributes:
@@ -90,7 +95,7 @@ class Part:
         """Return the measured rows and the weight of each, given weights (m,) per column."""
         return self.index, weight
 
-    def per_row(self) -> Part:
+    def per_row(self) -> ResidualPart:
         """Return the part with one column per measured row, in m or rad."""
         return self
 
@@ -112,7 +117,7 @@ class Part:
         return self.value
 
 
-def joined(pieces: Sequence[Part]) -> Part:
+def joined(pieces: Sequence[ResidualPart]) -> ResidualPart:
     """Return the part of consecutive pieces of a block, each with its own rows counted from 0."""
     values, jacobians, sigmas, indices = [], [], [], []
     nuisances = 0
@@ -136,7 +141,7 @@ def joined(pieces: Sequence[Part]) -> Part:
 
 
 @singledispatch
-def parts(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+def parts(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
     """Return the residual parts of one block by the function registered for its type.
 
     Args:
@@ -151,7 +156,7 @@ def parts(measured: PoseMeasurements, seen: Seen, jacobian: np.ndarray) -> list[
 
 
 @parts.register
-def _pose(measured: Poses, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+def _pose(measured: Poses, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
     """Pose residual, measured against predicted: r = [y - p; log(R_y Rᵀ)]; d log = J_r⁻¹(r) ω."""
     predicted = Rotation.from_matrix(seen.rotation.transpose(2, 1, 0))
     turn = (Rotation.from_quat(measured.quaternion) * predicted.inv()).as_rotvec().T
@@ -159,12 +164,12 @@ def _pose(measured: Poses, seen: Seen, jacobian: np.ndarray) -> list[Part]:
     sigma = None
     if measured.sigma_rotation is not None:
         sigma = measured.sigma_rotation.T
-    orientation = Part("orientation", turn, angular, sigma, 0, np.arange(len(measured)))
+    orientation = ResidualPart("orientation", turn, angular, sigma, 0, np.arange(len(measured)))
     return [*_position(measured, seen, jacobian), orientation]
 
 
 @parts.register
-def _position(measured: Positions, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+def _position(measured: Positions, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
     """Position residual, measured minus predicted: r = y - p, without the errors that all rows share."""
     value = measured.position.T - seen.point
     linear = jacobian[:, :3]
@@ -179,11 +184,11 @@ def _position(measured: Positions, seen: Seen, jacobian: np.ndarray) -> list[Par
     sigma = None
     if measured.sigma is not None:
         sigma = measured.sigma.T
-    return [Part("position", value, linear, sigma, shared, np.arange(len(measured)))]
+    return [ResidualPart("position", value, linear, sigma, shared, np.arange(len(measured)))]
 
 
 @parts.register
-def _distance(measured: Distances, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+def _distance(measured: Distances, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
     """Distance residual, measured minus predicted: r = L - |p_a - p_b| for the two rows of each pair."""
     first, second = _pairs(measured)
     gap = seen.point[:, first] - seen.point[:, second]
@@ -194,7 +199,7 @@ def _distance(measured: Distances, seen: Seen, jacobian: np.ndarray) -> list[Par
     sigma = None
     if measured.sigma is not None:
         sigma = measured.sigma[first][None]
-    return [Part("distance", value[None], along[:, None], sigma, 0, first)]
+    return [ResidualPart("distance", value[None], along[:, None], sigma, 0, first)]
 
 
 def _pairs(measured: Distances) -> tuple[np.ndarray, np.ndarray]:
@@ -210,7 +215,7 @@ def _pairs(measured: Distances) -> tuple[np.ndarray, np.ndarray]:
 
 
 @parts.register
-def _sockets(measured: Sockets, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+def _sockets(measured: Sockets, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
     """Socket residual: mean of the group minus p, and L - |mean_a - mean_b| for known socket distances L."""
     groups, group_of_row, counts = np.unique(measured.group, return_inverse=True, return_counts=True)
     rows = np.arange(len(measured))
@@ -224,7 +229,7 @@ def _sockets(measured: Sockets, seen: Seen, jacobian: np.ndarray) -> list[Part]:
     sigma = None
     if measured.sigma is not None:
         sigma = measured.sigma.T
-    result = [Part("consistency", value, slope, sigma, 3 * len(groups), rows)]
+    result = [ResidualPart("consistency", value, slope, sigma, 3 * len(groups), rows)]
     number = {int(group): k for k, group in enumerate(groups)}
     links = [link for link in measured.links if link[0] in number and link[1] in number]
     if links:
@@ -236,13 +241,13 @@ def _sockets(measured: Sockets, seen: Seen, jacobian: np.ndarray) -> list[Part]:
         along = np.einsum("il,fil->fl", gap / length, relative)
         value = np.array([link[2] for link in links]) - length
         first_rows = np.array([int(np.flatnonzero(group_of_row == k)[0]) for k in first])
-        result.append(Part("distance", value[None], along[:, None], None, 0, first_rows))
+        result.append(ResidualPart("distance", value[None], along[:, None], None, 0, first_rows))
     return result
 
 
 @parts.register(Planes)
 @parts.register(Bars)
-def _fitted(measured: Planes | Bars, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+def _fitted(measured: Planes | Bars, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
     """Residual against a plane (normal n) or a ball-bar centre c fitted to each group.
 
     Planes: r = -n · (p - mean). Bars: r = L - |p - c|.
@@ -274,7 +279,7 @@ def _fitted(measured: Planes | Bars, seen: Seen, jacobian: np.ndarray) -> list[P
     # all numbers of a smaller group
     unknowns = int(np.minimum(counts, 3).sum())
     label = "plane" if isinstance(measured, Planes) else "distance"
-    return [Part(label, value[None], slope[:, None], sigma, unknowns, np.arange(len(measured)))]
+    return [ResidualPart(label, value[None], slope[:, None], sigma, unknowns, np.arange(len(measured)))]
 
 
 def _sphere_centre(points: np.ndarray, lengths: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from calib.estimation.relevance import Gram
 from calib.geometry.installation import Installation
 from calib.geometry.many_corrections import row_statistics, separable
 from calib.geometry.observation import Block, layout, observe, parameter_values, whitened
-from calib.geometry.residuals import CommonNoise, Part
+from calib.geometry.residuals import CommonNoise, ResidualPart
 from calib.records import frozen
 from calib.robot.calibrated import CalibratedChain, CorrectedChain
 from calib.robot.chain import Chain
@@ -50,7 +50,7 @@ class Piece:
     """
 
     block: int
-    part: Part
+    part: ResidualPart
     sigma: np.ndarray
     weight: np.ndarray
 
@@ -275,7 +275,7 @@ class Weigher:
 
     def update(self, state: Installation, first: bool, resting: float = 0.0) -> None:
         """Set sigmas and weights from the residuals at a state; `resting`: parameters that rest on the prior."""
-        parts: list[tuple[int, Part]] = []
+        parts: list[tuple[int, ResidualPart]] = []
         for number, block in enumerate(self.blocks):
             parts += [(number, part) for part in observe(state, block, _NONE)]
         rows = sum(part.value.size for _, part in parts)
@@ -479,7 +479,7 @@ def _scales(pieces: list[Piece], number: int) -> list[np.ndarray]:
     return [piece.sigma / np.sqrt(piece.weight) for piece in pieces if piece.block == number]
 
 
-def _sigma(part: Part, share: float, start: bool, robustly: bool) -> np.ndarray:
+def _sigma(part: ResidualPart, share: float, start: bool, robustly: bool) -> np.ndarray:
     """Return standard deviations (rows, m) of a part: those of the file, or one estimated from the residuals."""
     if part.sigma is not None:
         return part.sigma
@@ -492,6 +492,6 @@ def _sigma(part: Part, share: float, start: bool, robustly: bool) -> np.ndarray:
     return np.full(part.value.shape, max(spread / np.sqrt(share), MIN_SIGMA))
 
 
-def _size(part: Part, sigma: np.ndarray) -> np.ndarray:
+def _size(part: ResidualPart, sigma: np.ndarray) -> np.ndarray:
     """Return each row's residual in sigmas (m,), rms over its components, without the noise that rows share."""
     return np.sqrt(np.mean((part.alone(sigma) / sigma) ** 2, axis=0))

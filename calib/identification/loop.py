@@ -163,7 +163,7 @@ def check_loop(table: object) -> object:
 
 
 @dataclass(frozen=True, eq=False)
-class Controller:
+class LoopController:
     """A sampled controller for n joints.
 
     Attributes:
@@ -209,21 +209,21 @@ class Controller:
         decay = np.exp(-2.0 * np.pi * self.cutoff * period)
         return float(1.0 - decay)
 
-    def scaled(self, factor: np.ndarray | float) -> Controller:
+    def scaled(self, factor: np.ndarray | float) -> LoopController:
         """Return the controller with all gains times `factor`, one or (n,): the same bandwidth at another inertia."""
         kp = self.kp * factor
         kd = self.kd * factor
         ki = self.ki * factor
         return replace(self, kp=kp, kd=kd, ki=ki)
 
-    def slower(self, factor: float) -> Controller:
+    def slower(self, factor: float) -> LoopController:
         """Return the controller with its bandwidth divided by `factor`: kp by factor², kd by factor, ki by factor³."""
         kp = self.kp / factor**2
         kd = self.kd / factor
         ki = self.ki / factor**3
         return replace(self, kp=kp, kd=kd, ki=ki)
 
-    def with_feedforward(self, ahead: np.ndarray) -> Controller:
+    def with_feedforward(self, ahead: np.ndarray) -> LoopController:
         """Return the controller with a feedforward torque (N, n) added."""
         return replace(self, ahead=frozen(ahead))
 
@@ -284,7 +284,7 @@ class LoopMetrics:
     strays_times: Array = ()  # type: ignore[assignment]
     valid: bool = True
     explains: bool = True
-    controller: Controller | None = None
+    controller: LoopController | None = None
     controller_explains_percent: Array | None = None
 
 
@@ -323,7 +323,7 @@ class LoopResults:
     metrics: LoopMetrics | None = None
     findings: tuple[Finding, ...] = ()
     table: tuple[tuple[object, ...], ...] = ()
-    controller: Controller | None = None
+    controller: LoopController | None = None
     disagreement: LoopDisagreement | None = None
 
 
@@ -343,7 +343,7 @@ class Replay:
 
     name: str
     seconds: float
-    controller: Controller | None
+    controller: LoopController | None
     stated: bool
     terms_left_out: tuple[str, ...]
     inertia_added: Array

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from calib.identification.settings import IdentificationSettings
     from calib.parallel.mechanism.parallel_robot import ParallelRobot
     from calib.parallel.robots import ParallelMechanism
-    from calib.procedure.robot_kinds import Stage
+    from calib.procedure.robot_kinds import CommandStage
 
 OFFERS = {"formats": ":FORMATS", "robots": ":"}
 FORMATS = {
@@ -36,7 +36,7 @@ def find(robot: object) -> ParallelMechanism | None:
     return robots.find(robot)
 
 
-def stages() -> Mapping[str, Stage]:
+def stages() -> Mapping[str, CommandStage]:
     """Return the implementation of each command for parallel robots."""
     from calib.parallel import verbs
 

@@ -28,7 +28,7 @@ from calib.parallel.mechanism.closure import ClosedRobot
 from calib.parallel.mechanism.parallel_model import PLATFORM, ParallelModel, make_parallel_model, rows_named
 from calib.parallel.mechanism.velocities import loop_jacobians, overconstraint
 from calib.parallel.robots import ParallelMechanism, refuse_unread
-from calib.procedure.dynamic_stage.identify import Assessment, Errors, ModelFindings, errors_of
+from calib.procedure.dynamic_stage.identify import DynamicsAssessment, ModelFindings, RecordingErrors, errors_of
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs, gather
 from calib.procedure.dynamic_stage.verdict import (
     excitation_notes,
@@ -185,7 +185,7 @@ def _preload(mechanism: ClosedRobot, inputs: IdentificationInputs, case: Case) -
 
 def assess(
     inputs: IdentificationInputs, identification: Identification[RegressorModel], findings: ModelFindings
-) -> Assessment:
+) -> DynamicsAssessment:
     """Return the prediction errors of a model on all recordings, with the verdict and its findings."""
     model = identification.dynamics.model
     cases = inputs.cases
@@ -197,11 +197,11 @@ def assess(
     encoders = settle(_encoders(model.mechanism, (*cases, *unseen)))
     noticed = (*rules, *motion, *findings.noticed, *encoders)
     notes = (*lines_of(noticed), *excitation_notes(errors.excitation), *findings.notes)
-    return Assessment(**field_values(errors), verdict=verdict, warnings=notes, noticed=noticed)
+    return DynamicsAssessment(**field_values(errors), verdict=verdict, warnings=notes, noticed=noticed)
 
 
 def _judged(
-    model: ParallelModel, identification: Identification[RegressorModel], cases: Sequence[Case], errors: Errors
+    model: ParallelModel, identification: Identification[RegressorModel], cases: Sequence[Case], errors: RecordingErrors
 ) -> tuple[Verdict, list[Finding]]:
     drives = friction_drives(_driven_joints(model, identification, cases), "a payload that the options do not name")
     if drives:

@@ -27,6 +27,7 @@ from calib.parallel.robots import ParallelMechanism, refuse_unread
 from calib.procedure.excitation.settings import DEFAULT_PLAN, PlanSettings
 from calib.procedure.robot_kinds import joints_of
 from calib.records import shaped
+from calib.robot.chain import Chain
 from calib.trajectories.setpoints import joined
 from calib.trajectories.timing.limits import TimingLimits
 from calib.trajectories.timing.path import Path as JointPath
@@ -149,7 +150,7 @@ def plan_parallel(
     motion = joined([track(timing.path, timing.profile, settings.rate, law.torque) for timing in timings])
     joints = joints_of(mechanism.robot)
     return ParallelPlan(
-        chain=cast(Any, mechanism.robot),
+        chain=cast(Chain, mechanism.robot),
         bounds=bounds,
         limits=limits,
         lower=joints.lower,

@@ -19,13 +19,13 @@ from calib.parallel.loop_fit import check_fit_target, fit_parallel
 from calib.parallel.plan import plan_parallel
 from calib.parallel.view import picture
 from calib.procedure.dynamic_stage.folder import check_identification_target
-from calib.procedure.robot_kinds import Stage
+from calib.procedure.robot_kinds import CommandStage
 
 STAGES = {
-    "fit": Stage(fit_parallel, check_fit_target),
-    "identify": Stage(identify_parallel, check_identification_target, assess),
-    "excite": Stage(excite_parallel, check_motion_target),
-    "plan": Stage(plan_parallel, check_motion_target),
-    "export": Stage(export_parallel, check_export_target),
-    "view": Stage(picture, check_motion_target),
+    "fit": CommandStage(fit_parallel, check_fit_target),
+    "identify": CommandStage(identify_parallel, check_identification_target, assess),
+    "excite": CommandStage(excite_parallel, check_motion_target),
+    "plan": CommandStage(plan_parallel, check_motion_target),
+    "export": CommandStage(export_parallel, check_export_target),
+    "view": CommandStage(picture, check_motion_target),
 }

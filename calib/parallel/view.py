@@ -21,7 +21,7 @@ DIMENSIONS.update(dict.fromkeys(COORDINATES[3:], "angle"))
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class MechanismPicture:
     """A parallel robot to draw, a `calib.results.scene.Drawn`; q (m, n) are readings of its actuated joints."""
 
     mechanism: ClosedRobot
@@ -102,6 +102,6 @@ class Picture:
         return q, *places, np.array(table.texts("set")) != "fit", turned
 
 
-def picture(robot: ParallelMechanism) -> Picture:
+def picture(robot: ParallelMechanism) -> MechanismPicture:
     """Return what is drawn of a robot."""
-    return Picture(robot.mechanism)
+    return MechanismPicture(robot.mechanism)

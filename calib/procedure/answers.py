@@ -124,6 +124,6 @@ class Answers:
     certificate: CertificateSection = field(default_factory=CertificateSection)
 
     @property
-    def cell(self) -> dict[str, object]:
+    def cell(self) -> dict[str, str | tuple[str, ...]]:
         """The answers that describe the cell: option name -> answer."""
         return {name: value for name in CELL if (value := getattr(self, name)) is not None}

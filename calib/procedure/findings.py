@@ -130,7 +130,7 @@ class Verdicts:
 
 
 @dataclass(frozen=True)
-class Entry:
+class CatalogueEntry:
     """One entry of the catalogue; the module's docstring explains its fields."""
 
     says: str
@@ -142,10 +142,10 @@ class Entry:
 
 
 @cache
-def catalogue() -> Mapping[str, Entry]:
+def catalogue() -> Mapping[str, CatalogueEntry]:
     """Return the catalogue, code -> entry."""
     text = Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")
-    return {code: Entry(**entry) for code, entry in tomllib.loads(text).items()}
+    return {code: CatalogueEntry(**entry) for code, entry in tomllib.loads(text).items()}
 
 
 def level_of(finding: Finding) -> str:
@@ -220,7 +220,7 @@ def as_notes(lines: Iterable[str], findings: Iterable[Finding]) -> list[Note]:
     return [Note(line, line in warnings) for line in lines]
 
 
-def _line(finding: Finding, entry: Entry) -> str:
+def _line(finding: Finding, entry: CatalogueEntry) -> str:
     text = sentence(finding)
     if finding.accepted:
         return f"{text} (accepted by the options)"
@@ -236,7 +236,7 @@ def glossary() -> Mapping[str, str]:
     return tomllib.loads(Path(__file__).with_name("glossary.toml").read_text(encoding="utf-8"))
 
 
-def levels(entry: Entry) -> str:
+def levels(entry: CatalogueEntry) -> str:
     """Return in words what level a finding has, and from which values on; a limit below zero is exceeded always."""
     rules = []
     for value, limits in entry.limits.items():

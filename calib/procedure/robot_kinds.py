@@ -32,7 +32,7 @@ class RobotKind(Protocol):
         """Return the robot that a person names; None where it is none of this kind."""
         ...
 
-    def stages(self) -> Mapping[str, Stage]:
+    def stages(self) -> Mapping[str, CommandStage]:
         """Return the implementation of each command."""
         ...
 
@@ -52,7 +52,7 @@ ROBOTS: Point[RobotKind] = Point("robots", "kinds of robot other than serial arm
 
 
 @dataclass(frozen=True)
-class Stage:
+class CommandStage:
     """Implementation of one command for robots of one kind.
 
     Attributes:
@@ -90,7 +90,7 @@ class Mechanism(Protocol):
         """Write ``robot.toml`` into a folder, so that the folder can be given as this robot."""
         ...
 
-    def model_table(self, dynamics: object, base: object, unit: str) -> dict[str, object]:
+    def model_table(self, dynamics: Any, base: Any, unit: str) -> dict[str, object]:
         """Return an identified model in the form of ``dynamics.json``."""
         ...
 
@@ -126,7 +126,7 @@ def mechanism(robot: object) -> Mechanism | None:
     return None
 
 
-def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None = None) -> Stage | None:
+def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None = None) -> CommandStage | None:
     """Return the implementation of a command for a robot (its `run` needs no robot argument); None for serial arms.
 
     Args:

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
@@ -126,36 +125,6 @@ class _Lines:
     def of_postures(self, chosen: np.ndarray) -> _Lines:
         """Return the lines in some of the postures: a mask (m,) or their numbers."""
         return _Lines(self.start[chosen], self.end[chosen], self.axes[chosen], self.origins[chosen])
-
-
-class DistanceModel(Protocol):
-    """Collision model of an arm in its surroundings: `Capsules`, or `calib.robot.collision.Collision`."""
-
-    @property
-    def pairs(self) -> tuple[tuple[str, str], ...]:
-        """Names of the compared pairs, in the order of the columns of `distances`."""
-        ...
-
-    @property
-    def excluded(self) -> tuple[tuple[str, str], ...]:
-        """Pairs that are not compared, since they touch in nearly every posture."""
-        ...
-
-    def distances(self, q: np.ndarray) -> np.ndarray:
-        """Return the distances (m, pairs) [m] at joint values q (m, n); negative: depth of penetration."""
-        ...
-
-    def gradients(self, q: np.ndarray) -> np.ndarray:
-        """Return the derivatives (m, pairs, n) of `distances`."""
-        ...
-
-    def free(self, q: np.ndarray, margin: float = 0.0) -> np.ndarray:
-        """Return the mask (m,) of joint values q (m, n) with all distances larger than `margin` [m]."""
-        ...
-
-    def beam(self, q: np.ndarray, start: np.ndarray, slope: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the links' distances from lines of sight to a target on the last body, with their derivatives."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,15 +14,17 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import ModuleType
+from typing import TypeAlias
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.errors import refuse_robot
 from calib.records import shaped
-from calib.robot.capsules import MIN_LENGTH, SAMPLES, TARGET_RADIUS, closing_speed, inseparable
+from calib.robot.capsules import MIN_LENGTH, SAMPLES, TARGET_RADIUS, Capsules, closing_speed, inseparable
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf
+from calib.robot.formats.native import NativeModel, NativeShape
 from calib.robot.formats.simulators import configurations, driven_joints, link_frame
 from calib.robot.formats.urdf_tree import Node, is_urdf, numbers, origin, parse, text
 from calib.robot.kinematics import sweep
@@ -168,6 +170,10 @@ class Collision:
     def free(self, q: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Return the mask (m,) of joint values q (m, n) with all distances larger than `margin` [m]."""
         return np.all(self.distances(q) > margin, axis=1)
+
+
+DistanceModel: TypeAlias = Collision | Capsules
+"""Collision model of an arm in its surroundings."""
 
 
 def from_urdf(

@@ -51,6 +51,7 @@ from scipy.spatial.transform import Rotation
 from calib.config import parse, strict
 from calib.config_types import Angle, Flag, Length, Name, Numeric, OneOf, Whole
 from calib.errors import RobotError, one_of, refuse_robot, require
+from calib.records import FieldValues
 from calib.robot import tables
 from calib.robot.chain import Chain, Element, Joint
 
@@ -277,7 +278,7 @@ def _row(entry: RowTable, next_index: int, where: str) -> Row:
 
 def _regroup(chain: Chain, index: int, group: list[Element]) -> Row:
     """Return the MDH row of a group of elements with one number; the caller checks order and completeness."""
-    values: dict[str, Any] = {element.name.removesuffix(str(index)): element.value for element in group}
+    values: FieldValues = {element.name.removesuffix(str(index)): element.value for element in group}
     moving = [element for element in group if element.joint is not None]
     if not moving:
         return Row(name=f"joint{index}", index=index, kind="fixed", **values)

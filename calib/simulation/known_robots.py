@@ -6,16 +6,16 @@ Motions for simulated robots: random Fourier series within limits, and moves wit
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
+from calib.config_types import ParsedTable
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
 from calib.identification.closed_loop.controllers import Reference, pd
 from calib.identification.closed_loop.simulation import Plant
-from calib.identification.loop import Controller
+from calib.identification.loop import LoopController
 from calib.records import shaped
 from calib.robot import description, library
 
@@ -150,7 +150,7 @@ SIDED = ("Ia", "Fvl", "Fcl", "offl", "Fvm", "Fcm", "offm")  # drive terms of a j
 
 
 @cache
-def truth(name: str) -> dict[str, Any]:
+def truth(name: str) -> ParsedTable:
     """Return the true parameters of ``tx40``, ``rv2sq`` or ``lwr4plus``."""
     return description.read_extra(library.path(f"{name}_truth"))["truth"]
 
@@ -188,7 +188,7 @@ def plant(name: str, coupled: bool = False, offset: np.ndarray | None = None) ->
     return Plant(bodies_of(chain), tuple(terms), parameters)
 
 
-def controller(name: str) -> Controller:
+def controller(name: str) -> LoopController:
     """Return the published PD controller of the TX40 or RV-2SQ."""
     gains = truth(name)["control"]
     limit = np.array(gains.get("limit", np.inf))

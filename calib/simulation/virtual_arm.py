@@ -20,7 +20,7 @@ from calib.dynamics.torque_rows import LINK
 from calib.errors import CalibError
 from calib.identification.closed_loop.controllers import Reference, pd
 from calib.identification.closed_loop.simulation import Plant, Sensing, feed_forward, simulate
-from calib.identification.loop import Controller
+from calib.identification.loop import LoopController
 from calib.robot import library
 from calib.robot.chain import Chain, random_joints
 from calib.simulation import known_robots
@@ -63,7 +63,7 @@ class MovingArm:
     plant: Plant
     link: IdentificationModel
     believed: Plant
-    gains: Controller
+    gains: LoopController
     effort: np.ndarray
     note: str
     unmodelled: TorqueErrors

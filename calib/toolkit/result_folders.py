@@ -1,19 +1,19 @@
 """Results: their folders, figures and verdicts, and how they are shown."""
 
 from calib.api.dynamic import DynamicsModel
-from calib.api.kinematic import GeometryFit
-from calib.api.rendering import Drawn, Judged, Unjudged, saved
+from calib.api.kinematic import GeometryFit, Several, fit_geometry
+from calib.api.rendering import ChartedResult, Judged, Progress, Shown, Unjudged, saved
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.metrics import UnseenReport
 from calib.procedure.export.delivery import fit_verdicts, prediction
 from calib.procedure.export.geometry import read as read_exported
 from calib.procedure.export.geometry import results as geometry_results
-from calib.procedure.findings import LEVELS, Verdict, limit, lines_of, sentence, settle
+from calib.procedure.findings import LEVELS, Verdict, limit, lines_of, notes_of, sentence, settle
 from calib.procedure.kinematic_stage.folder import IN_SESSION, URDF, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.procedure.kinematic_stage.inputs import read_file as read_measured_file
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics, ValidationMetrics
-from calib.procedure.kinematic_stage.settings import FitSettings, Tolerance
+from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.tables import read_covariance
 from calib.procedure.robot_kinds import joints_of, stage_of
 from calib.results.registry import drawn, open_result
@@ -26,8 +26,8 @@ __all__ = [
     "LEVELS",
     "URDF",
     "VALIDATED",
+    "ChartedResult",
     "ComparedRows",
-    "Drawn",
     "DrawnRobot",
     "DynamicsModel",
     "ErrorSizes",
@@ -39,10 +39,12 @@ __all__ = [
     "Judged",
     "Measured",
     "Played",
+    "Progress",
     "Result",
     "Scene",
+    "Several",
+    "Shown",
     "StoredResult",
-    "Tolerance",
     "Torques",
     "Unjudged",
     "UnseenReport",
@@ -50,12 +52,14 @@ __all__ = [
     "ValidationMetrics",
     "Verdict",
     "drawn",
+    "fit_geometry",
     "fit_verdicts",
     "geometry_results",
     "joints_of",
     "limit",
     "lines_of",
     "load_robot",
+    "notes_of",
     "open_result",
     "prediction",
     "read_covariance",

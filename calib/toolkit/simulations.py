@@ -2,7 +2,7 @@
 
 from calib.identification.closed_loop.controllers import Reference
 from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun, feed_forward, simulate
-from calib.identification.loop import Controller, LoopSettings
+from calib.identification.loop import LoopController, LoopSettings
 from calib.simulation.camera_cell import CameraCell, limits_of, seen_by_camera, take_pictures
 from calib.simulation.cell import (
     Cell,
@@ -29,7 +29,7 @@ __all__ = [
     "TRUTH",
     "CameraCell",
     "Cell",
-    "Controller",
+    "LoopController",
     "LoopSettings",
     "MovingArm",
     "Plant",

@@ -9,13 +9,13 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from queue import Empty, SimpleQueue
 from threading import Lock
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from calib.errors import CalibError, UsageError, refused_as
 from calib.workers.processes import Answer, Died, run_call
 
 if TYPE_CHECKING:
-    from distributed import Client, Future  # pyright: ignore[reportMissingImports]
+    from distributed import Future  # pyright: ignore[reportMissingImports]
 
 T = TypeVar("T")
 ANSWER = 10.0  # [s] that a Dask scheduler has to answer (our choice)
@@ -27,9 +27,9 @@ class _Cluster:
 
     attempts = 1
 
-    def __init__(self, address: str, client: "Client") -> None:
+    def __init__(self, address: str, client: Any) -> None:
         self.address, self.client, self.done, self.busy = address, client, SimpleQueue["Future"](), Lock()
-        self.under_way = dict[str, tuple[int, "Future"]]()
+        self.under_way = dict[object, tuple[int, "Future"]]()
         self.threads, self.asked, self.manned = 1, -1.0, time.monotonic()
 
     def free(self) -> int:

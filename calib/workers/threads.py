@@ -77,7 +77,7 @@ def _limit() -> None:
     import scipy.linalg  # noqa: F401  (with numpy's, the BLAS of all that calib computes)
 
     for library in _libraries():
-        threads = library.num_threads
+        threads = library.num_threads or 1
         _largest[library] = max(threads, _largest.get(library, 1))
         if threads == _largest[library]:
             _before[library] = threads

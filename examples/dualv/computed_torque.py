@@ -17,7 +17,7 @@ import numpy as np
 from calib.dynamics import rigid_body
 from calib.identification.closed_loop.controllers import Reference
 from calib.identification.closed_loop.simulation import Sensing, added_inertia
-from calib.identification.loop import Controller
+from calib.identification.loop import LoopController
 from calib.parallel.mechanism.parallel_model import ParallelModel, along, wrench_regressor
 from calib.parallel.mechanism.simulation import ParallelPlant
 from calib.parallel.mechanism.velocities import LoopMotion
@@ -84,7 +84,7 @@ def simulate(
     back = np.linalg.pinv(motion.jacobians.readings)
     inertia = _platform_inertia(model, controller.values, motion, carried)
     omega, ones = 2.0 * np.pi * controller.frequency, np.ones(robot.n)
-    law = Controller(
+    law = LoopController(
         omega**2 * ones, 2.0 * controller.damping * omega * ones, 0.0 * ones, ones,
         np.array([joint.effort for joint in robot.joints]), np.inf * ones, ahead=ahead,
     )  # fmt: skip

@@ -23,7 +23,7 @@ from calib.dynamics.torque_rows import LINK, MOTOR, TorqueRows
 from calib.estimation.triangles import Triangles, absorb, empty
 from calib.identification.closed_loop.controllers import Reference, pd
 from calib.identification.closed_loop.simulation import Plant, Sensing, feed_forward, simulate
-from calib.identification.loop import Controller
+from calib.identification.loop import LoopController
 from calib.identification.rows import Case, make_case, observe
 from calib.robot.chain import Chain
 from calib.simulation import known_robots, lwr4plus
@@ -111,7 +111,7 @@ def _record(chain: Chain, reference: Reference, loaded: bool, seed: list[int]) -
     )
 
 
-def controller(plant: Plant, reference: Reference) -> Controller:
+def controller(plant: Plant, reference: Reference) -> LoopController:
     """Return a PD controller (8 Hz, damping 0.8, our choice) with feed-forward of gravity and friction."""
     omega, inertia = 2 * np.pi * 8.0, plant.inertia_diagonal(reference.q[::500])
     slow = replace(reference, a=0.0 * reference.a)

@@ -42,7 +42,7 @@ from calib.identification.closed_loop.controllers import Reference, identify_con
 from calib.identification.closed_loop.instrumental import Instrumental, Round, identify_instrumental
 from calib.identification.closed_loop.loop_recordings import Loop, simulated_case
 from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun, simulate
-from calib.identification.loop import Controller
+from calib.identification.loop import LoopController
 from calib.identification.methods.constraint_settings import ConstraintSettings
 from calib.identification.methods.parameter_constraints import hold, make_constraints
 from calib.identification.rows import Case, make_case, observe
@@ -86,7 +86,7 @@ class Study:
     plant: Plant
     model: IdentificationModel
     base: Base
-    controller: Controller
+    controller: LoopController
     seed: int
 
     @property
@@ -143,7 +143,9 @@ def with_measured(study: Study, log: Log, values: np.ndarray) -> tuple[np.ndarra
     return rows.target, rows.matrix @ values
 
 
-def with_simulated(study: Study, log: Log, values: np.ndarray, controller: Controller) -> tuple[np.ndarray, np.ndarray]:
+def with_simulated(
+    study: Study, log: Log, values: np.ndarray, controller: LoopController
+) -> tuple[np.ndarray, np.ndarray]:
     """Return decimated torque and prediction Z x, Z from a noise-free simulation with x itself."""
     plant = Plant(study.model.bodies, study.model.terms, study.base.to_standard(values))
     loop = Loop(controller, log.reference, EVERY)
@@ -160,7 +162,7 @@ def torque_error(study: Study, reference: Reference, values: np.ndarray) -> list
 
 
 def judge(
-    study: Study, training: Log, others: list[Log], results: dict[str, Instrumental], controller: Controller
+    study: Study, training: Log, others: list[Log], results: dict[str, Instrumental], controller: LoopController
 ) -> dict[str, Any]:
     """Return the errors of least squares and of instrumental methods (direct and cross), and the test results."""
     first = next(iter(results.values()))
@@ -214,7 +216,7 @@ def verdict(result: Instrumental) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def estimate(study: Study, log: Log, controller: Controller, method: str) -> Instrumental:
+def estimate(study: Study, log: Log, controller: LoopController, method: str) -> Instrumental:
     """Return the estimate of IV, PC-IV or DIDIM from a log, with an assumed controller.
 
     The regular robot they start from has the motors' inertia, as on a data sheet.
@@ -238,7 +240,7 @@ def essential_count(study: Study, training: Log) -> dict[str, Any]:
     return {"F": len(gone.kept), "names": [study.base.names[k] for k in gone.kept], "slides": SLIDES["essential"]}
 
 
-def controllers(study: Study, log: Log) -> dict[str, Controller]:
+def controllers(study: Study, log: Log) -> dict[str, LoopController]:
     """Return the controllers to try on degraded data: identified from that log, and wrong ones."""
     found = identify_controller(log.reference, log.seen, np.asarray(log.run.tau), RATE / EVERY)
     right = study.controller

@@ -11,7 +11,7 @@ from calib.dynamics import base, drives, rigid_body
 from calib.dynamics import drives as friction
 from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
 from calib.dynamics.idim import IdentificationModel, from_chain
-from calib.dynamics.shapes import JointRange
+from calib.dynamics.shapes import RecordedRange
 from calib.dynamics.torque_rows import BOTH, DRIVE, LINK, MODELS, MOTOR
 from calib.errors import CalibError
 from calib.robot.library import load
@@ -249,7 +249,7 @@ def test_richer_friction_has_columns_of_its_own():
     rich = (
         friction.term("Fva2", "speed", 1),
         friction.term("Ft2", "load", 1, 0.01),
-        *friction.offered("presliding", 1, JointRange(0.01, 1.0, 1.0, 2.0))[:2],
+        *friction.offered("presliding", 1, RecordedRange(0.01, 1.0, 1.0, 2.0))[:2],
     )
     plain = IdentificationModel(bodies_of(chain), drives.standard(["Ia Fv Fc off"] * 6))
     full = IdentificationModel(bodies_of(chain), plain.terms + rich)

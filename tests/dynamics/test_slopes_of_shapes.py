@@ -6,7 +6,7 @@ import pytest
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.shapes import SHAPES, Joined
+from calib.dynamics.shapes import SHAPES, TermMotion
 from calib.errors import CalibError
 from calib.robot.library import load
 
@@ -37,7 +37,7 @@ def term_of(shape, settings):
 
 def motion(dx=0.0, dv=0.0, da=0.0):
     x, v = (axis.ravel() for axis in np.meshgrid(GRID, GRID))
-    return Joined(x + dx, v + dv, 0.5 * x - v + da)
+    return TermMotion(x + dx, v + dv, 0.5 * x - v + da)
 
 
 def slope_errors(term):

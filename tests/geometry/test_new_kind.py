@@ -13,7 +13,7 @@ from calib.geometry.accuracy import errors
 from calib.geometry.fit import fit
 from calib.geometry.installation import Installation, Seen, see
 from calib.geometry.observation import layout
-from calib.geometry.residuals import Part, parts
+from calib.geometry.residuals import ResidualPart, parts
 from calib.robot.chain import random_joints
 from calib.robot.library import load
 
@@ -31,10 +31,10 @@ class Heights(PoseMeasurements):
 
 
 @parts.register
-def _heights(measured: Heights, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+def _heights(measured: Heights, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
     value = measured.height[None] - seen.point[2:]
     sigma = None if measured.sigma is None else measured.sigma[None]
-    return [Part("distance", value, jacobian[:, 2:3], sigma, 0, np.arange(len(measured)))]
+    return [ResidualPart("distance", value, jacobian[:, 2:3], sigma, 0, np.arange(len(measured)))]
 
 
 @dataclass(frozen=True, eq=False)

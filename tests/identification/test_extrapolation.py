@@ -8,7 +8,7 @@ import pytest
 
 from calib.data.signals.filtering import design_decimator
 from calib.dynamics import drives
-from calib.dynamics.shapes import Joined
+from calib.dynamics.shapes import TermMotion
 from calib.identification.friction.passivity import braking, driven
 from calib.identification.identify import Identification, identify
 from calib.identification.prediction import Dynamics, predict
@@ -41,7 +41,7 @@ def without_friction(case: Case) -> Case:
 def test_a_shape_that_bends_keeps_its_value_beyond_the_edge(one):
     def at(v: float) -> float:
         state = np.array([0.0]), np.array([v]), np.array([0.0])
-        return float(one.values(Joined(*state))[0])
+        return float(one.values(TermMotion(*state))[0])
 
     assert at(6.0) == at(2.0) != at(1.0)
     assert at(-6.0) == at(-2.0)

@@ -6,7 +6,7 @@ import numpy as np
 import planted_motion
 import pytest
 
-from calib.dynamics.shapes import Joined
+from calib.dynamics.shapes import TermMotion
 from calib.identification.friction import ripple
 from calib.identification.friction.ripple import GearTravel
 from calib.records import frozen
@@ -37,7 +37,7 @@ def explained(one: ripple.Ripple, where: GearTravel, torque: np.ndarray) -> floa
     for own, value in zip(one.terms, one.values):
         source = own.acts[0][1][0][0]
         q, v = where.q[:, source], where.v[:, source]
-        predicted += value * own.values(Joined(q, v, np.zeros_like(q)))
+        predicted += value * own.values(TermMotion(q, v, np.zeros_like(q)))
     return 1.0 - float(np.sum((torque - predicted) ** 2) / np.sum(torque**2))
 
 

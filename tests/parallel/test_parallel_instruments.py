@@ -11,7 +11,7 @@ from calib.errors import CannotSimulate, UsageError
 from calib.identification.closed_loop.controllers import Reference, pd
 from calib.identification.closed_loop.simulation import Sensing
 from calib.identification.identify_options import parse_options
-from calib.identification.loop import Controller
+from calib.identification.loop import LoopController
 from calib.parallel.identification import identify_parallel
 from calib.parallel.mechanism.closure import closed
 from calib.parallel.mechanism.geometric_fit import changed, visible_directions
@@ -19,7 +19,7 @@ from calib.parallel.mechanism.parallel_model import along
 from calib.parallel.robots import ParallelMechanism, find
 
 
-def gains(name: str, kp: float, kd: float) -> Controller:
+def gains(name: str, kp: float, kd: float) -> LoopController:
     ones = np.ones(find(name).chain.n)
     return pd(kp * ones, kd * ones)
 

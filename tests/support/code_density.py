@@ -56,6 +56,7 @@ class Density:
     nested_per_100_statements: float  # statements with NESTED_STATEMENT of those or more
     empty_names_percent: float  # of all names that are bound
     fmt_skip: int
+    any_annotations: int  # uses of typing.Any: each hides an argument or a result from the type checker
 
 
 def modules(package: str) -> list[Path]:
@@ -124,7 +125,7 @@ def measure(package: str) -> Density:
 
 def density_of(texts: list[str]) -> Density:
     """Return the density of modules by their source texts."""
-    statements = tokens = condensed = nested = bindings = empty = skips = 0
+    statements = tokens = condensed = nested = bindings = empty = skips = unchecked = 0
     for text in texts:
         tree = ast.parse(text)
         starts = token_starts(text)
@@ -136,6 +137,7 @@ def density_of(texts: list[str]) -> Density:
             count = sum(isinstance(node, CONDENSED_EXPRESSIONS) for node in ast.walk(statement))
             condensed += count
             nested += count >= NESTED_STATEMENT
+        unchecked += sum(isinstance(node, ast.Name) and node.id == "Any" for node in ast.walk(tree))
         for name in bound_names(tree):
             bindings += 1
             empty += name.strip("_") in EMPTY_NAMES
@@ -145,6 +147,7 @@ def density_of(texts: list[str]) -> Density:
         nested_per_100_statements=100 * nested / max(statements, 1),
         empty_names_percent=100 * empty / max(bindings, 1),
         fmt_skip=skips,
+        any_annotations=unchecked,
     )
 
 

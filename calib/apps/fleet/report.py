@@ -7,7 +7,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,7 +24,7 @@ from calib.errors import Finding, RobotError, counted, finding
 from calib.records import plain
 from calib.result_kinds import BY_NAME
 from calib.toolkit.installations import PLAUSIBLE
-from calib.toolkit.report_pages import Block, Column, Section, Text, table
+from calib.toolkit.report_pages import Block, RecordColumn, Section, Text, table
 from calib.toolkit.result_folders import Judged, Verdict, notes_of, settle
 from calib.units import small
 
@@ -84,13 +83,13 @@ class FleetReport(Judged):
     def section(self) -> Section:
         """Return the report's section."""
         drift = [
-            Column("arm", "{0[0]}", number=False),
-            Column("from", _earlier_folder, False),
-            Column("to", _later_folder, False),
-            Column("tool moved, mm rms", _moved_mm),
-            Column("σ of that", _expected_mm),
-            Column("p", "{0[1].geometry.probability:.1g}"),
-            Column("", "{0[1].verdict.level}", number=False),
+            RecordColumn("arm", "{0[0]}", number=False),
+            RecordColumn("from", _earlier_folder, False),
+            RecordColumn("to", _later_folder, False),
+            RecordColumn("tool moved, mm rms", _moved_mm),
+            RecordColumn("σ of that", _expected_mm),
+            RecordColumn("p", "{0[1].geometry.probability:.1g}"),
+            RecordColumn("", "{0[1].verdict.level}", number=False),
         ]
         blocks: list[Block] = [
             Text("Notes", notes_of(self.noticed), "note"),
@@ -130,7 +129,7 @@ class FleetReport(Judged):
         files.write_table(folder / ARMS, ARMS_HEADER, rows)
         files.write_json(folder / folders.METRICS, self.to_dict())
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the numbers as in ``metrics.json`` [SI]."""
         types = {}
         for arm_type in self.types:
@@ -172,25 +171,25 @@ def _expected_mm(row: tuple[str, RobotChange]) -> str:
 
 def _tables(arm_type: ArmType) -> list[Block]:
     parameters = [
-        Column("parameter", "{0.name}", number=False),
-        Column("arms", "{0.arms}"),
-        Column("mean", lambda row: small(row.mean, row.unit, 3)),
-        Column("sigma", lambda row: small(row.sigma, row.unit, 3)),
-        Column("width", lambda row: small(row.width, row.unit, 3)),
+        RecordColumn("parameter", "{0.name}", number=False),
+        RecordColumn("arms", "{0.arms}"),
+        RecordColumn("mean", lambda row: small(row.mean, row.unit, 3)),
+        RecordColumn("sigma", lambda row: small(row.sigma, row.unit, 3)),
+        RecordColumn("width", lambda row: small(row.width, row.unit, 3)),
     ]
     tool_columns = [
-        Column("tool", "{0.tool}", number=False),
-        Column("arms", _arm_count),
-        Column("from the others' mm", _displacement_mm),
-        Column("σ", "{0.moved_sigmas:.1f}"),
-        Column("error, times the others'", "{0.times:.3g}"),
-        Column("σ ", _error_sigmas),
+        RecordColumn("tool", "{0.tool}", number=False),
+        RecordColumn("arms", _arm_count),
+        RecordColumn("from the others' mm", _displacement_mm),
+        RecordColumn("σ", "{0.moved_sigmas:.1f}"),
+        RecordColumn("error, times the others'", "{0.times:.3g}"),
+        RecordColumn("σ ", _error_sigmas),
     ]
     arms = [
-        Column("arm", _serial_or_name, number=False),
-        Column("calibrated", "{0.name}", number=False),
-        Column("verdict", "{0.judged[0]}", number=False),
-        Column("rms mm", _residual_mm),
+        RecordColumn("arm", _serial_or_name, number=False),
+        RecordColumn("calibrated", "{0.name}", number=False),
+        RecordColumn("verdict", "{0.judged[0]}", number=False),
+        RecordColumn("rms mm", _residual_mm),
     ]
     note = "Deviations from nominal; the next arm is expected within width of the mean."
     compared = [row for row in arm_type.tools if row.moved is not None]

@@ -16,8 +16,16 @@ from calib.errors import Finding, UsageError, require
 from calib.records import plain
 from calib.result_kinds import BY_NAME
 from calib.toolkit.pose_data import FitOptions, read_fit_options
-from calib.toolkit.report_pages import Column, Section, Text, table
-from calib.toolkit.result_folders import Drawn, Judged, Verdict, load_robot, notes_of, read_measured_file, settle
+from calib.toolkit.report_pages import RecordColumn, Section, Text, table
+from calib.toolkit.result_folders import (
+    ChartedResult,
+    Judged,
+    Verdict,
+    load_robot,
+    notes_of,
+    read_measured_file,
+    settle,
+)
 from calib.toolkit.sessions import Trend, noise_of_difference, repeats, trends
 
 if TYPE_CHECKING:
@@ -29,7 +37,7 @@ CAPTION = "Targets of repeated poses less the arm's prediction."
 
 
 @dataclass(frozen=True, eq=False)
-class DriftFound(Drawn, Judged):
+class DriftFound(ChartedResult, Judged):
     """Drift of the target over a measurement. ``print`` shows verdict, trends and repeated poses.
 
     Attributes:
@@ -54,15 +62,15 @@ class DriftFound(Drawn, Judged):
     def section(self) -> Section:
         """Return a report section with the trends, and how far repeated poses are apart."""
         columns = [
-            Column("with", "{0.what}", number=False),
-            Column("poses", "{0.poses}"),
-            Column("visits", "{0.x.size}"),
-            Column("slope", _rate),
-            Column("x mm", lambda trend: f"{1e3 * trend.slope[0]:+.2g}"),
-            Column("y mm", lambda trend: f"{1e3 * trend.slope[1]:+.2g}"),
-            Column("z mm", lambda trend: f"{1e3 * trend.slope[2]:+.2g}"),
-            Column("in all mm", lambda trend: f"{1e3 * trend.total:.3g}"),
-            Column("σ", lambda trend: f"{trend.sigmas:.1f}"),
+            RecordColumn("with", "{0.what}", number=False),
+            RecordColumn("poses", "{0.poses}"),
+            RecordColumn("visits", "{0.x.size}"),
+            RecordColumn("slope", _rate),
+            RecordColumn("x mm", lambda trend: f"{1e3 * trend.slope[0]:+.2g}"),
+            RecordColumn("y mm", lambda trend: f"{1e3 * trend.slope[1]:+.2g}"),
+            RecordColumn("z mm", lambda trend: f"{1e3 * trend.slope[2]:+.2g}"),
+            RecordColumn("in all mm", lambda trend: f"{1e3 * trend.total:.3g}"),
+            RecordColumn("σ", lambda trend: f"{trend.sigmas:.1f}"),
         ]
         blocks = [Text("Notes", notes_of(self.noticed), "note"), table("Drift of the target", columns, self.trends)]
         return Section("Drift", blocks, self.verdict.level, self.verdict.reason)

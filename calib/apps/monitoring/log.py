@@ -17,8 +17,8 @@ from calib.apps.monitoring.comparison.robot_change import diff
 from calib.errors import SessionError, UsageError, command_line, require
 from calib.records import plain
 from calib.result_kinds import BY_NAME
-from calib.toolkit.report_pages import Column, Section, table
-from calib.toolkit.result_folders import Drawn, Judged, Unjudged
+from calib.toolkit.report_pages import RecordColumn, Section, table
+from calib.toolkit.result_folders import ChartedResult, Judged, Unjudged
 from calib.toolkit.sessions import Session, folders_of, open_session, position_errors, torque_error
 
 if TYPE_CHECKING:
@@ -99,7 +99,7 @@ class LogLine:
 
 
 @dataclass(frozen=True, eq=False)
-class RobotLog(Drawn, Judged, Unjudged):
+class RobotLog(ChartedResult, Judged, Unjudged):
     """The calibrations of one robot, oldest first. ``print`` shows a line for each."""
 
     robot: str
@@ -111,15 +111,15 @@ class RobotLog(Drawn, Judged, Unjudged):
     def section(self) -> Section:
         """Return a report section with a line per calibration."""
         columns = [
-            Column("date", "{0.date}", number=False),
-            Column("folder", "{0.folder}", number=False),
-            Column("serial", "{0.serial}", number=False),
-            Column("verdict", "{0.verdict}", number=False),
-            Column("nominal mm", _nominal_error),
-            Column("calibrated mm", _calibrated_error),
-            Column("torque %", _torque_error),
-            Column("tool moved mm", _motion),
-            Column("most by", "{0.parameter}", number=False),
+            RecordColumn("date", "{0.date}", number=False),
+            RecordColumn("folder", "{0.folder}", number=False),
+            RecordColumn("serial", "{0.serial}", number=False),
+            RecordColumn("verdict", "{0.verdict}", number=False),
+            RecordColumn("nominal mm", _nominal_error),
+            RecordColumn("calibrated mm", _calibrated_error),
+            RecordColumn("torque %", _torque_error),
+            RecordColumn("tool moved mm", _motion),
+            RecordColumn("most by", "{0.parameter}", number=False),
         ]
         return Section("Log", [table(f"Calibrations of {self.robot}", columns, self.lines)])
 

@@ -178,4 +178,4 @@ def checked(session: Session, kind: str) -> list[str]:
     plan = UNSEEN
     if kind == "measured":
         plan = POSES
-    return notes_on(session, chain, blocks, plan)
+    return [str(note) for note in notes_on(session, chain, blocks, plan)]

@@ -20,7 +20,7 @@ from calib.toolkit.chains import Chain, load, random_joints
 from calib.toolkit.installations import fit_installation, install
 from calib.toolkit.recordings import USABLE, FilterOptions, Recording, design_decimator, make_motion, read_trajectory
 from calib.toolkit.simulations import (
-    Controller,
+    LoopController,
     LoopSettings,
     Plant,
     Reference,
@@ -287,7 +287,7 @@ def _robots(condition: Condition, setup: Setup, seed: int) -> _Robots:
     return robots
 
 
-def _recorded(condition: Condition, setup: Setup, true: Plant, controller: Controller, seed: int) -> Case:
+def _recorded(condition: Condition, setup: Setup, true: Plant, controller: LoopController, seed: int) -> Case:
     """Return the recording of one noisy run of the true robot, as a case."""
     sensing = Sensing(condition.sigma_q, 0.0, condition.sigma_tau, every=setup.every)
 
@@ -311,7 +311,7 @@ def _recorded(condition: Condition, setup: Setup, true: Plant, controller: Contr
     return make_case(condition.name, replace(motion, decimator=decimator, band=decimator.band))
 
 
-def _loop(condition: Condition, controller: Controller) -> LoopSettings:
+def _loop(condition: Condition, controller: LoopController) -> LoopSettings:
     """Return the loop settings for the methods, with the errors of the condition."""
     kp = kd = 1.0
     if condition.mismatch == "controller":

@@ -29,7 +29,7 @@ from calib.toolkit.model_identification import (
     overlaps,
     repeated_motion,
 )
-from calib.toolkit.report_pages import Block, Column, Section, Text, table
+from calib.toolkit.report_pages import Block, RecordColumn, Section, Text, table
 from calib.toolkit.result_folders import Verdict, lines_of
 from calib.toolkit.torque_models import METHODS, Case, IdentificationSettings, Method, method_named, predict
 
@@ -386,18 +386,18 @@ def _choice(method: ComparedMethod) -> str:
 
 
 COLUMNS = (
-    Column("rank", "{0.rank}"),
-    Column("method", "{0.name}", number=False),
-    Column("unseen [%]", "{0.unseen:.3g} ± {0.sigma:.2g}"),
-    Column("behind the best", _behind),
-    Column("raw [%]", "{0.raw:.3g}"),
-    Column("training [%]", "{0.training:.3g}"),
-    Column("worst joint", "{0.worst[0]}: {0.worst[1]:.3g} %"),
-    Column("parameters", "{0.parameters}"),
-    Column("rounds", "{0.iterations}"),
-    Column("simulations", "{0.simulations}"),
-    Column("seconds", "{0.seconds:.2g}"),
-    Column("choice", _choice, number=False),
+    RecordColumn("rank", "{0.rank}"),
+    RecordColumn("method", "{0.name}", number=False),
+    RecordColumn("unseen [%]", "{0.unseen:.3g} ± {0.sigma:.2g}"),
+    RecordColumn("behind the best", _behind),
+    RecordColumn("raw [%]", "{0.raw:.3g}"),
+    RecordColumn("training [%]", "{0.training:.3g}"),
+    RecordColumn("worst joint", "{0.worst[0]}: {0.worst[1]:.3g} %"),
+    RecordColumn("parameters", "{0.parameters}"),
+    RecordColumn("rounds", "{0.iterations}"),
+    RecordColumn("simulations", "{0.simulations}"),
+    RecordColumn("seconds", "{0.seconds:.2g}"),
+    RecordColumn("choice", _choice, number=False),
 )
 
 

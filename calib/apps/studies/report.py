@@ -35,7 +35,7 @@ from calib.apps.studies.summary import (
 from calib.apps.studies.trial import TrialRow
 from calib.errors import UsageError, require
 from calib.toolkit.report_charts import AFTER, BEFORE, MARK, Chart, Layer, Panel, box, line, picture, text
-from calib.toolkit.report_pages import Block, Column, Picture, Pictures, Section, Table, Text, table
+from calib.toolkit.report_pages import Block, Picture, Pictures, RecordColumn, ReportTable, Section, Text, table
 from calib.workers import workers
 
 # Height of one method in a box plot [in].
@@ -105,8 +105,8 @@ def _short(value: float) -> str:
     return f"{value:.1e}"
 
 
-def _median(header: str, figure: str) -> Column:
-    return Column(header, lambda method: _short(method.figures[figure].median))
+def _median(header: str, figure: str) -> RecordColumn:
+    return RecordColumn(header, lambda method: _short(method.figures[figure].median))
 
 
 def _failures(method: MethodSummary) -> str:
@@ -144,11 +144,11 @@ def _is_chosen(method: MethodSummary) -> bool:
 
 
 COLUMNS = (
-    Column("method", "{0.method}", number=False),
-    Column("trials", "{0.trials}"),
-    Column("failed", _failures),
+    RecordColumn("method", "{0.method}", number=False),
+    RecordColumn("trials", "{0.trials}"),
+    RecordColumn("failed", _failures),
     _median("torque [%]", "torque_error"),
-    Column("quartiles", _quartiles),
+    RecordColumn("quartiles", _quartiles),
     _median("worst joint [%]", "torque_worst"),
     _median("β [%]", "beta_error"),
     _median("in σ", "beta_sigma"),
@@ -158,13 +158,13 @@ COLUMNS = (
     _median("rounds", "iterations"),
     _median("simulations", "simulations"),
     _median("CPU [s]", "cpu"),
-    Column("p", _p_value),
-    Column("", _mark, number=False),
+    RecordColumn("p", _p_value),
+    RecordColumn("", _mark, number=False),
 )
 ON_CONSOLE = ("method", "trials", "failed", "torque [%]", "quartiles", "covered [%]", "CPU [s]", "")
 
 
-def overview(conditions: Sequence[ConditionSummary]) -> Table:
+def overview(conditions: Sequence[ConditionSummary]) -> ReportTable:
     """Return a table of the recommended method of each condition."""
     lines = []
     for summary in conditions:
@@ -188,10 +188,10 @@ def overview(conditions: Sequence[ConditionSummary]) -> Table:
                 failed.append(f"{method.method} {sum(method.failures.values())}/{method.trials}")
         lines.append((name, description, chosen, chosen_error, best, ", ".join(as_good), ", ".join(failed)))
     header = ("condition", "", "take", "torque [%]", "best [%]", "as good", "without an estimate")
-    return Table("What to take", header, lines, numbers=(3,))
+    return ReportTable("What to take", header, lines, numbers=(3,))
 
 
-def torque_table(conditions: Sequence[ConditionSummary]) -> Table:
+def torque_table(conditions: Sequence[ConditionSummary]) -> ReportTable:
     """Return a table of the median torque error of every method on every condition."""
     names: list[str] = []
     for summary in conditions:
@@ -208,7 +208,7 @@ def torque_table(conditions: Sequence[ConditionSummary]) -> Table:
         f"{MIN_DATA_SETS} runs."
     )
     numbers = range(1, len(names) + 1)
-    return Table("Torque error on unseen motion", ("condition", *names), lines, note, numbers=numbers)
+    return ReportTable("Torque error on unseen motion", ("condition", *names), lines, note, numbers=numbers)
 
 
 def _median_cell(method: MethodSummary | None) -> str:
@@ -258,7 +258,7 @@ def _described(condition: Condition) -> str:
     return description
 
 
-def condition_table(summary: ConditionSummary, names: Sequence[str] = ON_CONSOLE) -> Table:
+def condition_table(summary: ConditionSummary, names: Sequence[str] = ON_CONSOLE) -> ReportTable:
     """Return a table of all methods on a condition, best first; by default with the columns for a terminal."""
     columns = [column for column in COLUMNS if column.name in names]
     title = f"Methods on {summary.condition.name}"

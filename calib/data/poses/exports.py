@@ -54,7 +54,7 @@ _AXIS = re.compile(r"(?:actual|measured|meas|position|pos)?([xyz])(?:actual|meas
 _TURN = re.compile(r"[rq][xyzw]")
 
 
-class Export(io.StringIO):
+class InstrumentExport(io.StringIO):
     """A file as the toolkit's own table of text, with notes on how it was read."""
 
     notes: tuple[str, ...] = ()
@@ -82,7 +82,7 @@ def presets() -> dict[str, dict[str, str]]:
     return tomllib.loads(Path(__file__).with_name("presets.toml").read_text(encoding="utf-8"))
 
 
-def translated(path: str | Path) -> Export | None:
+def translated(path: str | Path) -> InstrumentExport | None:
     """Return the file at `path` as a table of the toolkit; None where it is one already, or no table of positions."""
     with open(path, "rb") as file:
         beginning = file.read(HEAD)
@@ -103,7 +103,7 @@ def translated(path: str | Path) -> Export | None:
         text = (beginning + file.read()).decode(encoding, errors="replace")
 
     length_unit = _length_unit(preset, head, lines[: grid.first])
-    export = Export()
+    export = InstrumentExport()
     writer = csv.writer(export, lineterminator="\n")
     columns = [k for k, name in enumerate(names) if name]
     header = []

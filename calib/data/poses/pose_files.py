@@ -32,7 +32,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -66,6 +65,7 @@ from calib.data.poses.measurements import (
 )
 from calib.data.poses.robodk import FORMS
 from calib.data.schema import Joints, refuse
+from calib.records import FieldValues
 
 
 def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasurements:
@@ -79,7 +79,7 @@ def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasureme
     single = [name for name, size in zip(names, np.bincount(group)) if size == 1]
     if single:
         notes = (f"{layout.kind} {', '.join(single[:5])}: a group of one row determines nothing",)
-    common: dict[str, Any] = {
+    common: FieldValues = {
         "group": group,
         "group_names": names,
         "tool": tool,
@@ -324,7 +324,7 @@ def _read_targets(sheet: Sheet, layout: Layout, q: np.ndarray) -> Positions:
     for columns, count in zip(layout.positions, hidden_counts):
         if count:
             notes.append(f"{', '.join(columns)}: not seen in {count} of {len(visible)} rows")
-    common: dict[str, Any] = {
+    common: FieldValues = {
         "sigma": None if sigma is None else sigma[row, target],
         "tool": tool,
         "tool_names": names,

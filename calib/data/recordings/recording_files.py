@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -32,6 +31,7 @@ from calib.data.recordings.recording_options import (
 from calib.data.schema import Joints
 from calib.errors import MeasurementError, refuse_data, suggestion
 from calib.files import check_regular
+from calib.records import FieldValues
 
 
 def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends: Ends = (None, None)) -> Recording:
@@ -57,7 +57,7 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
     table.check(headings, headings)
 
     kind = "current" if "current" in columns_of else "torque"
-    series: dict[str, Any] = {}
+    series: FieldValues = {}
     for name, columns in columns_of.items():
         if name != "t":
             values = [_values(table, column, name, options) for column in columns]

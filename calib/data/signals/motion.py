@@ -8,7 +8,7 @@ recorded (on the even grid): the parallel decimation filters them, and every col
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -26,7 +26,7 @@ from calib.data.signals.bandwidth import USABLE, Cutoffs, check_cutoff, propose_
 from calib.data.signals.resampling import CLOCKS, GAP, Resampled, SamplingReport, resample
 from calib.errors import MeasurementError, UsageError, refuse_data, refused_as, require
 from calib.files import check_regular
-from calib.records import frozen, read_only
+from calib.records import FieldValues, frozen, read_only
 
 # Share of a joint's peak speed below which it stands, for friction (the TX40's own thresholds are this share).
 STANDSTILL_SHARE = 0.01
@@ -157,7 +157,7 @@ class Motion:
 
     def part(self, rows: slice) -> "Motion":
         """Return the motion of a slice of its samples."""
-        series: dict[str, Any] = {}
+        series: dict[str, object] = {}
         for name in ROWS:
             values = getattr(self, name)
             if values is not None:
@@ -234,7 +234,7 @@ def make_motion(
         raise filtering.too_short(int(mask.sum()), decimator)
 
     rows = _span(mask)
-    series: dict[str, Any] = {}
+    series: FieldValues = {}
     for name, values in sampled.series.items():
         if name != "q":
             series["v_measured" if name == "v" else name] = read_only(values[rows])

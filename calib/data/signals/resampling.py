@@ -61,7 +61,7 @@ SAMPLE_REACH = 0.75
 
 
 @dataclass(frozen=True, eq=False)
-class Clock:
+class SampleClock:
     """Times at which the samples of a recording were taken.
 
     Attributes:
@@ -81,7 +81,7 @@ class Clock:
     roughness: dict[str, float]
 
 
-def find_clock(recording: Recording, kind: str = "auto") -> Clock:
+def find_clock(recording: Recording, kind: str = "auto") -> SampleClock:
     """Return the clock `kind`; with ``auto`` the clock with the smoothest positions.
 
     Raises:
@@ -110,7 +110,7 @@ def find_clock(recording: Recording, kind: str = "auto") -> Clock:
         smoothest = min(relative, key=relative.__getitem__)
         kind = smoothest if relative[smoothest] < MAX_ROUGHNESS else "stamps"
     t, keep, period = clocks[kind]
-    return Clock(kind, frozen(t), frozen(keep, bool), period, step_ratio, relative)
+    return SampleClock(kind, frozen(t), frozen(keep, bool), period, step_ratio, relative)
 
 
 def _read_twice(recording: Recording) -> np.ndarray:
@@ -248,7 +248,7 @@ class SamplingReport:
         dropped: (start, length) [s] of segments too short to use.
     """
 
-    clock: Clock
+    clock: SampleClock
     rate: float
     jitter: tuple[float, float]
     repeated: int
@@ -360,7 +360,7 @@ def resample(recording: Recording, clock: str = "auto", gap: float = GAP, rate: 
 
 def _sampling_report(
     recording: Recording,
-    clock: Clock,
+    clock: SampleClock,
     rate: float,
     t: np.ndarray,
     is_gap: np.ndarray,

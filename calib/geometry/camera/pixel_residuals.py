@@ -30,7 +30,7 @@ from calib.data.poses import IN_HAND
 from calib.errors import refuse_data
 from calib.estimation import robust
 from calib.geometry.installation import Seen
-from calib.geometry.residuals import Part, parts
+from calib.geometry.residuals import ResidualPart, parts
 from calib.records import Frozen
 
 # change of a noise that repeats no fit, as a share, and of its [m, rad] (our choice)
@@ -133,7 +133,7 @@ STEEPEST = {"pinhole": 2.0, "fisheye": 10.0}  # tangent of the angle off the axi
 
 
 @dataclass(frozen=True, eq=False)
-class PixelPart(Part):
+class PixelPart(ResidualPart):
     """Residuals of corners, ordered by image; ``jacobian`` is the Jacobian of each image's board pose.
 
     Attributes:
@@ -154,6 +154,7 @@ class PixelPart(Part):
     depth: np.ndarray
     axes: np.ndarray
     carried: np.ndarray
+    noise: ImageNoise | None = field(default=None, kw_only=True)
 
     @property
     def height(self) -> int:
@@ -168,11 +169,13 @@ class PixelPart(Part):
         count = np.bincount(self.index)
         return np.sqrt(np.bincount(self.index, square)[count > 0] / count[count > 0])
 
-    def per_row(self) -> Part:
+    def per_row(self) -> ResidualPart:
         images, image, count = np.unique(self.index, return_inverse=True, return_counts=True)
         mean = np.array([np.bincount(image, axis / self.depth) / count for axis in self.value])
         flat = np.vstack([mean, np.zeros(len(images))])  # along the line of sight a mean offset says nothing
-        return Part("position", np.einsum("mij,jm->im", self.axes[images], flat), self.jacobian[:, :0], None, 0, images)
+        return ResidualPart(
+            "position", np.einsum("mij,jm->im", self.axes[images], flat), self.jacobian[:, :0], None, 0, images
+        )
 
     def row_weights(self, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         images, image, count = np.unique(self.index, return_inverse=True, return_counts=True)
@@ -258,7 +261,7 @@ def _whitened(rows: np.ndarray, shared: np.ndarray) -> np.ndarray:
 
 
 @parts.register
-def _pixels(measured: Pixels, seen: Seen, jacobian: np.ndarray) -> list[Part]:
+def _pixels(measured: Pixels, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
     """Return the corner residuals r = y - π(point) of a block of images, with their Jacobians."""
     if seen.view is None:
         refuse_data(measured.file, "the camera of these images is unknown")

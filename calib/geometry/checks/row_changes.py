@@ -60,7 +60,7 @@ DRIFTS = {"station": "station-drifts", "target": "target-wanders", "zero": "zero
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class WhitenedRows:
     """Whitened rows of one block, in the order of its file.
 
     Attributes:
@@ -79,13 +79,13 @@ class Rows:
     pull: np.ndarray
     metres: np.ndarray
 
-    def some(self, rows: np.ndarray) -> "Rows":
+    def some(self, rows: np.ndarray) -> "WhitenedRows":
         """Return some of the rows."""
         measured = take(self.block.measured, rows)
         block = Block(measured, self.block.station, self.block.tool[rows])
-        return Rows(block, self.residual[rows], self.matrix[rows], self.precision, self.pull, self.metres[rows])
+        return WhitenedRows(block, self.residual[rows], self.matrix[rows], self.precision, self.pull, self.metres[rows])
 
-    def with_columns(self, columns: np.ndarray) -> "Rows":
+    def with_columns(self, columns: np.ndarray) -> "WhitenedRows":
         """Return the rows with further columns (m, d, k), of what changed."""
         count = columns.shape[2]
         matrix = np.concatenate([self.matrix, columns], axis=2)
@@ -143,7 +143,7 @@ class Subject:
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class RowChange:
     """A change of one subject over an order of the rows.
 
     Attributes:
@@ -185,7 +185,7 @@ def row_changes(fit: GeometricFit) -> list[Finding]:
     return findings
 
 
-def _rows_of(fit: GeometricFit, number: int) -> Rows:
+def _rows_of(fit: GeometricFit, number: int) -> WhitenedRows:
     """Return a block's rows, whitened, with the columns of all rigid parameters."""
     measured = fit.blocks[number].measured
     (block,) = prepare(fit.cell, [take(measured, evenly(len(measured), MAX_ROWS))])
@@ -204,10 +204,10 @@ def _rows_of(fit: GeometricFit, number: int) -> Rows:
     from_nominal = (parameter_values(fit.start) - parameter_values(fit.cell))[columns]
     from_nominal[np.array(table.kinds)[columns] != "arm"] = 0.0
     metres = np.full(len(residual), max(sigmas["position"], MIN_NOISE))
-    return Rows(block, residual, matrix, precision, from_nominal * precision, metres)
+    return WhitenedRows(block, residual, matrix, precision, from_nominal * precision, metres)
 
 
-def _without_gross(rows: Rows) -> Rows:
+def _without_gross(rows: WhitenedRows) -> WhitenedRows:
     """Return the rows without those that are far off whatever the rigid arm, which would hide all else."""
     for _ in range(GROSS_PASSES):
         size = np.linalg.norm(rows.residuals(rows.solve()), axis=1)
@@ -218,7 +218,7 @@ def _without_gross(rows: Rows) -> Rows:
     return rows
 
 
-def _subjects(fit: GeometricFit, rows: Rows) -> list[Subject]:
+def _subjects(fit: GeometricFit, rows: WhitenedRows) -> list[Subject]:
     """Return what may have changed: the station, the instrument's scale, each target, and the zero of each joint."""
     cell = fit.cell
     table = layout(cell)
@@ -244,7 +244,7 @@ def _subjects(fit: GeometricFit, rows: Rows) -> list[Subject]:
     return [subject for subject in subjects if subject.count]
 
 
-def _best_change(rows: Rows, subjects: Sequence[Subject]) -> Change | None:
+def _best_change(rows: WhitenedRows, subjects: Sequence[Subject]) -> RowChange | None:
     """Return the change over the rows that explains the residuals; None where none does."""
     residuals = rows.residuals(rows.solve())
     cost = float(np.sum(residuals**2))
@@ -273,7 +273,7 @@ def _information(cost: float, count: int, parameters: int) -> float:
     return count * np.log(max(cost, 1e-300)) + parameters * np.log(count)
 
 
-def _significant(change: Change, cost: float, dof: float, hypotheses: int) -> bool:
+def _significant(change: RowChange, cost: float, dof: float, hypotheses: int) -> bool:
     """Return whether a change explains the residuals by Fisher's test, and leaves little of them."""
     # slow to load
     from scipy.stats import f
@@ -286,7 +286,9 @@ def _significant(change: Change, cost: float, dof: float, hypotheses: int) -> bo
     return chance * hypotheses < MAX_CHANCE and variance < MAX_LEFT**2 * cost / dof
 
 
-def _changes(rows: Rows, residuals: np.ndarray, subjects: Sequence[Subject], order: np.ndarray) -> Iterator[Change]:
+def _changes(
+    rows: WhitenedRows, residuals: np.ndarray, subjects: Sequence[Subject], order: np.ndarray
+) -> Iterator[RowChange]:
     """Yield the best step and the drift of each subject over an order (m,) of the rows.
 
     Args:
@@ -322,12 +324,12 @@ def _changes(rows: Rows, residuals: np.ndarray, subjects: Sequence[Subject], ord
             shape = np.zeros(count)
             shape[rank[cut:]] = 1.0
             between = float(sorted_order[cut - 1]), float(sorted_order[cut])
-            yield Change(subject, shape, between, float(gains[best]))
+            yield RowChange(subject, shape, between, float(gains[best]))
         ramp_score = np.tensordot(ramp, score, 1)[None]
         ramp_square = np.tensordot(ramp**2, square, 1)[None]
         ramp_shared = np.tensordot(ramp, shared, 1)[None]
         gain = _gains(ramp_score, ramp_square, ramp_shared)
-        yield Change(subject, ramp, None, float(gain[0]))
+        yield RowChange(subject, ramp, None, float(gain[0]))
 
 
 def _sums_behind(terms: np.ndarray, rank: np.ndarray, cuts: np.ndarray) -> np.ndarray:
@@ -344,7 +346,7 @@ def _gains(score: np.ndarray, square: np.ndarray, shared: np.ndarray) -> np.ndar
     return np.einsum("ck,ck->c", score, solution[:, :, 0])
 
 
-def _gains_over_other_orders(rows: Rows, residuals: np.ndarray, subjects: Sequence[Subject]) -> Iterator[float]:
+def _gains_over_other_orders(rows: WhitenedRows, residuals: np.ndarray, subjects: Sequence[Subject]) -> Iterator[float]:
     """Yield the gains of changes over joint values and the target's coordinates, which are not of time."""
     measured = rows.block.measured
     assert isinstance(measured, Positions)
@@ -353,7 +355,7 @@ def _gains_over_other_orders(rows: Rows, residuals: np.ndarray, subjects: Sequen
             yield change.gain
 
 
-def _holds_on_held_out(rows: Rows, change: Change) -> bool:
+def _holds_on_held_out(rows: WhitenedRows, change: RowChange) -> bool:
     """Return whether the change explains rows that did not determine it."""
     changed = rows.with_columns(change.columns)
     count = len(rows.residual)
@@ -366,13 +368,13 @@ def _holds_on_held_out(rows: Rows, change: Change) -> bool:
     return changed_squares < MAX_LEFT_UNSEEN**2 * squares
 
 
-def _squares_on(rows: Rows, held_out: np.ndarray, fitted: np.ndarray) -> float:
+def _squares_on(rows: WhitenedRows, held_out: np.ndarray, fitted: np.ndarray) -> float:
     """Return the sum of squares of some rows with the estimate by others."""
     residuals = rows.some(held_out).residuals(rows.some(fitted).solve())
     return float(np.sum(residuals**2))
 
 
-def _described(rows: Rows, change: Change) -> Finding:
+def _described(rows: WhitenedRows, change: RowChange) -> Finding:
     """Return the finding on a change, with its size and σ."""
     extended = rows.with_columns(change.columns)
     estimate = extended.solve()

@@ -189,7 +189,7 @@ def fold_statistics(
     measured = [take(block, rows) for block, rows in zip(measured, sample)]
     folds_of_rows = [members[rows] for members, rows in zip(folds.members, sample)]
     weights = [weight[rows] for weight, rows in zip(fit.row_weights(), sample)]
-    rows = _Rows(cell, measured, free, fit.used_sigmas(), weights, fit.used_noises())
+    rows = _FoldRows(cell, measured, free, fit.used_sigmas(), weights, fit.used_noises())
     # with instruments alone a fold's training rows are all rows but its own, so that statistics subtract
     pooled = all(block.has_instrument for block in measured)
     held_out_shares = list[list[Share]]()
@@ -276,7 +276,7 @@ def blind_folds(nominal: GeometricFit, measured: Sequence[PoseMeasurements], fol
         sigmas[piece.block][piece.part.label] = max(rms, 1e-9)
     prior = np.minimum(plausible_deviation(nominal.cell, free), FRAME_SIGMA)
     scales = np.outer(prior, prior)
-    rows = _Rows(nominal.cell, measured, free, sigmas, nominal.row_weights(), [None] * len(measured))
+    rows = _FoldRows(nominal.cell, measured, free, sigmas, nominal.row_weights(), [None] * len(measured))
     statistics = []
     mean_squares = []
     noise = 0.0
@@ -322,7 +322,7 @@ def _sum(shares: Sequence[Share], in_metres: bool = False) -> Gram:
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
+class _FoldRows:
     """Measured blocks with the weights of their rows: rms sigma by label, robust weights, noise of images."""
 
     cell: Installation

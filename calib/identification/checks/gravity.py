@@ -105,7 +105,7 @@ def gravity_of(motions: Sequence[MotionSamples], chain: Chain, newtons: bool = T
         chain: the arm, whose masses count where it has any.
         newtons: whether torques are in N m; of those in another unit only proportions count.
     """
-    sums = _Sums(motions)
+    sums = _GravitySums(motions)
     stated = np.array(motions[0].bodies.gravity)
     before = sums.unexplained(stated)
     direction = _another_direction(sums, stated, before)
@@ -131,7 +131,7 @@ def gravity_of(motions: Sequence[MotionSamples], chain: Chain, newtons: bool = T
     return GravityHypotheses(stated, before, direction, after, ambiguous, absent, factors, sigmas)
 
 
-def _another_direction(sums: "_Sums", stated: np.ndarray, before: np.ndarray) -> np.ndarray | None:
+def _another_direction(sums: "_GravitySums", stated: np.ndarray, before: np.ndarray) -> np.ndarray | None:
     """Return the gravity vector (3,) of the stated one's magnitude that explains the torques instead; None if it does.
 
     Args:
@@ -152,7 +152,7 @@ def _another_direction(sums: "_Sums", stated: np.ndarray, before: np.ndarray) ->
 
 
 def _without_gravity(
-    sums: "_Sums", gravity: np.ndarray, unexplained: np.ndarray, candidates: Sequence[int]
+    sums: "_GravitySums", gravity: np.ndarray, unexplained: np.ndarray, candidates: Sequence[int]
 ) -> tuple[int, ...]:
     """Return the joints whose torques hold no gravity: those that are better explained without.
 
@@ -181,7 +181,7 @@ def _without_gravity(
     return tuple(sorted(absent))
 
 
-class _Sums:
+class _GravitySums:
     """Products of the columns of motions by joint: bodies in motion without gravity, in each of x, y, z, and drives."""
 
     def __init__(self, motions: Sequence[MotionSamples]) -> None:
@@ -290,7 +290,7 @@ def _angle(first: np.ndarray, second: np.ndarray) -> float:
     return float(np.arccos(np.clip(first @ second / size, -1.0, 1.0)))
 
 
-def _best_direction(sums: _Sums, magnitude: float, unexplained: np.ndarray) -> np.ndarray:
+def _best_direction(sums: _GravitySums, magnitude: float, unexplained: np.ndarray) -> np.ndarray:
     """Return the gravity vector (3,) of a magnitude [m/s²] that leaves least unexplained, of both signs either.
 
     Joints are weighed by what masses of their own for each axis leave of them (n,), then by what the direction leaves.

@@ -92,12 +92,12 @@ def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
         return None
     columns, torque = _rows(samples, rate)
     middle = count // 2
-    first = _Rows.of(columns[:, :middle], torque[:, :, :middle])
-    second = _Rows.of(columns[:, middle:], torque[:, :, middle:])
+    first = _LagRows.of(columns[:, :middle], torque[:, :, :middle])
+    second = _LagRows.of(columns[:, middle:], torque[:, :, middle:])
     square = first.square + second.square
     cross = first.cross + second.cross
     power = first.power + second.power
-    total = _Rows(columns, torque, square, cross, power)
+    total = _LagRows(columns, torque, square, cross, power)
     lag = _lag_in(total)
     half_lags = [_lag_in(first), _lag_in(second)]
     difference = abs(half_lags[0].seconds - half_lags[1].seconds) / 2.0
@@ -123,7 +123,7 @@ def _single_joint(lag: Lag, half_lags: Sequence[Lag]) -> int | None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
+class _LagRows:
     """Rows of a fit of n joints' torques at S lags, and their products by joint, which add up over parts of a motion.
 
     Attributes:
@@ -138,7 +138,7 @@ class _Rows:
     power: np.ndarray
 
     @classmethod
-    def of(cls, columns: np.ndarray, torque: np.ndarray) -> "_Rows":
+    def of(cls, columns: np.ndarray, torque: np.ndarray) -> "_LagRows":
         """Return the rows of columns and torques with their products."""
         across = columns.transpose(0, 2, 1)
         cross = across @ torque.transpose(0, 2, 1)
@@ -156,14 +156,14 @@ def _rows(samples: MotionSamples, rate: float) -> tuple[np.ndarray, np.ndarray]:
     return np.ascontiguousarray(columns.transpose(1, 0, 2)), torque
 
 
-def _lag_in(rows: _Rows) -> Lag:
+def _lag_in(rows: _LagRows) -> Lag:
     """Return the least-squares lag of the rows, with its sigma from the spread between joints."""
     n = len(rows.torque)
     spread = rows.torque[:, RECORDED].std(axis=1)
-    fit = _Fit(rows, 1.0 / np.maximum(spread, 1e-12))
+    fit = _LagFit(rows, 1.0 / np.maximum(spread, 1e-12))
     for _ in range(ROUNDS):
         residual = fit.residual(np.full(n, fit.common.argmin()))
-        fit = _Fit(rows, fit.weight / np.maximum(residual.std(axis=1), 1e-12))
+        fit = _LagFit(rows, fit.weight / np.maximum(residual.std(axis=1), 1e-12))
     best = int(fit.common.argmin())
     between_steps = STEP * _parabola_minimum(fit.common, best)
     ratio = fit.common[RECORDED] / max(fit.common[best], 1e-300)
@@ -186,7 +186,7 @@ def _lag_in(rows: _Rows) -> Lag:
     )
 
 
-class _Fit:
+class _LagFit:
     """Least squares of the joints' torques at any lags: projections at every lag are computed once.
 
     Attributes:
@@ -198,7 +198,7 @@ class _Fit:
         common: (shifts,) squared residual where all joints have the same lag.
     """
 
-    def __init__(self, rows: _Rows, weight: np.ndarray) -> None:
+    def __init__(self, rows: _LagRows, weight: np.ndarray) -> None:
         """Project torques, weighted (n,), onto the columns of all joints."""
         self.rows = rows
         self.weight = weight

@@ -13,7 +13,7 @@ import numpy as np
 
 from calib.data.signals.filtering import border, low_pass
 from calib.errors import CalibError, MeasurementError
-from calib.identification.loop import Controller, LoopSettings
+from calib.identification.loop import LoopController, LoopSettings
 from calib.records import frozen, shaped
 
 
@@ -69,11 +69,13 @@ class Reference:
         return q, v, a
 
 
-def pd(kp: np.ndarray, kd: np.ndarray, limit: np.ndarray | float = np.inf, ki: np.ndarray | float = 0.0) -> Controller:
+def pd(
+    kp: np.ndarray, kd: np.ndarray, limit: np.ndarray | float = np.inf, ki: np.ndarray | float = 0.0
+) -> LoopController:
     """Return a PD (or PID) controller."""
     share = np.asarray(1.0)
     windup = np.asarray(np.inf)
-    return Controller(kp, kd, np.asarray(ki), share, np.asarray(limit), windup)
+    return LoopController(kp, kd, np.asarray(ki), share, np.asarray(limit), windup)
 
 
 def cascade(
@@ -82,7 +84,7 @@ def cascade(
     reset: np.ndarray | float = np.inf,
     limit: np.ndarray | float = np.inf,
     share: float = 1.0,
-) -> Controller:
+) -> LoopController:
     """Return a cascade P-PI: v_c = share v_r + P e, tau = K [(v_c - v) + ∫ (v_c - v) / Ti], as a single law.
 
     (v_c - v) integrates to share q_r - q + P ∫ e (start aside): with share = 1 that is kp = K (P + 1/Ti), kd = K,
@@ -100,12 +102,12 @@ def cascade(
     ki = velocity * position / np.asarray(reset, dtype=float)
     kp = velocity * (position + 1.0 / np.asarray(reset, dtype=float))
     windup = np.asarray(np.inf)
-    return Controller(kp, velocity, ki, np.asarray(share), np.asarray(limit), windup)
+    return LoopController(kp, velocity, ki, np.asarray(share), np.asarray(limit), windup)
 
 
 def computed_torque(
     model: np.ndarray, frequency: float, damping: float, n: int, limit: np.ndarray | float = np.inf
-) -> Controller:
+) -> LoopController:
     """Return a computed-torque controller with error dynamics ë + 2 ζ ω ė + ω² e = 0 for an exact model.
 
     Args:
@@ -117,20 +119,20 @@ def computed_torque(
     no_integral = np.zeros(n)
     share = np.ones(n)
     windup = np.asarray(np.inf)
-    return Controller(kp, kd, no_integral, share, np.asarray(limit), windup, model=frozen(model))
+    return LoopController(kp, kd, no_integral, share, np.asarray(limit), windup, model=frozen(model))
 
 
-def completed(controller: Controller, loop: LoopSettings, n: int) -> Controller:
+def completed(controller: LoopController, loop: LoopSettings, n: int) -> LoopController:
     """Return the controller with the saturation, delay and velocity filter given in the settings."""
     share = np.full(n, loop.share)
     limit = loop.per_joint("limit", n)
     windup = loop.per_joint("windup", n)
-    return Controller(
+    return LoopController(
         controller.kp, controller.kd, controller.ki, share, limit, windup, delay=loop.delay, cutoff=loop.velocity_cutoff
     )
 
 
-def stated_controller(loop: LoopSettings, n: int) -> Controller:
+def stated_controller(loop: LoopSettings, n: int) -> LoopController:
     """Return the controller of n joints that the table [loop] describes.
 
     Raises:
@@ -163,7 +165,7 @@ class IdentifiedController:
         explained: (n,) share of the low-passed torque by the PID's feedback, 100 (1 - ‖tau - τ̂‖ / ‖tau - mean‖) [%].
     """
 
-    controller: Controller
+    controller: LoopController
     explained: np.ndarray
 
 

@@ -26,7 +26,7 @@ from calib.identification.closed_loop.controllers import (
 )
 from calib.identification.closed_loop.simulation import SimulatedRun, plant_of
 from calib.identification.closed_loop.timing import check_no_copy, motor_torques, reference_shift
-from calib.identification.loop import Controller, LoopSettings
+from calib.identification.loop import LoopController, LoopSettings
 from calib.identification.rows import Case, segments
 
 DEGREES = 180.0 / np.pi
@@ -45,7 +45,7 @@ class Loop:
             J(x_k) / design, so that its bandwidth is constant (Gautier & Janot). None: gains as stated.
     """
 
-    controller: Controller
+    controller: LoopController
     reference: Reference
     every: float = 1
     design: np.ndarray | None = None
@@ -63,7 +63,7 @@ class ClosedLoops:
     """
 
     pairs: tuple[tuple[Case, Loop], ...]
-    controller: Controller
+    controller: LoopController
     identified: IdentifiedController | None
     notes: tuple[str, ...]
 
@@ -184,7 +184,7 @@ def _compare(motion: Motion, reference: np.ndarray, joint: int, max_difference: 
     )
 
 
-def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., Controller]) -> tuple[float, tuple[str, ...]]:
+def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., LoopController]) -> tuple[float, tuple[str, ...]]:
     """Return by how much later than stated the reference of a recording was played [s], and notes.
 
     A stated time is kept, and refused where the torques contradict it.
@@ -289,7 +289,7 @@ def _inside(motion: Motion, settling_time: float = 0.2) -> slice:
     return slice(max(edge, settling_samples), len(motion) - edge)
 
 
-def _controller(loop: LoopSettings, case: Case) -> tuple[Controller, IdentifiedController | None, tuple[str, ...]]:
+def _controller(loop: LoopSettings, case: Case) -> tuple[LoopController, IdentifiedController | None, tuple[str, ...]]:
     """Return the controller (stated, or identified from the longest part), its identification result, and notes."""
     n = case.motion.n
     if loop.controller != "identify":
@@ -340,14 +340,14 @@ def _best_shift(identified: Callable[[float], IdentifiedController]) -> float:
 
 
 def _fed_forward(
-    controller: Controller,
+    controller: LoopController,
     loop: LoopSettings,
     cad: np.ndarray | None,
     model: Any,
     motion: Motion,
     reference: Reference,
     every: float,
-) -> Controller:
+) -> LoopController:
     """Return the controller with its feedforward torques along the reference."""
     if loop.feedforward == "none":
         return controller

@@ -28,7 +28,7 @@ from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.rigid_body import mass_matrix
 from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, require
 from calib.identification.closed_loop.controllers import Reference
-from calib.identification.loop import Controller
+from calib.identification.loop import LoopController
 from calib.records import frozen, shaped
 
 Packed = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
@@ -87,7 +87,7 @@ class Plant:
         factors = np.append(carried_columns, np.ones(len(self.terms)))
         return self.with_parameters(self.parameters * factors)
 
-    def run(self, controller: Controller, reference: Reference, sensing: Sensing | None = None) -> SimulatedRun:
+    def run(self, controller: LoopController, reference: Reference, sensing: Sensing | None = None) -> SimulatedRun:
         """Return the simulated motion of the robot that follows a reference; see `simulate`."""
         return simulate(self, controller, reference, sensing)
 
@@ -152,7 +152,7 @@ class SimulatedRun:
 
 def simulate(
     plant: Plant,
-    controller: Controller,
+    controller: LoopController,
     reference: Reference,
     sensing: Sensing | None = None,
     seed: int | np.random.Generator = 0,
@@ -413,7 +413,7 @@ def feed_forward(believed: Plant, reference: Reference) -> np.ndarray:
 
 def tracking_error(
     robot: Plant,
-    controller: Controller,
+    controller: LoopController,
     reference: Reference,
     ahead: np.ndarray | None = None,
     push: np.ndarray | None = None,

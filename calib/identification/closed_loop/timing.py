@@ -18,7 +18,7 @@ from calib.data.signals.motion import Motion
 from calib.errors import NotConverged, refuse_data
 from calib.estimation.whiteness import inflation
 from calib.identification.closed_loop.controllers import Reference
-from calib.identification.loop import Controller
+from calib.identification.loop import LoopController
 from calib.identification.rows import Case
 
 # [s] by which a reference may be off (this and all below: our choice)
@@ -44,7 +44,7 @@ class ReferenceShift:
 
 
 def reference_shift(
-    case: Case, reference: Reference, every: float, controller: Controller, band: float
+    case: Case, reference: Reference, every: float, controller: LoopController, band: float
 ) -> ReferenceShift:
     """Return by how much later than stated the reference of a recording's part without gaps was played.
 
@@ -87,7 +87,7 @@ def reference_shift(
 class _Law:
     """Control law of a recording as splines in time: reference, measured positions and torques, low-passed."""
 
-    def __init__(self, case: Case, reference: Reference, every: float, controller: Controller, band: float) -> None:
+    def __init__(self, case: Case, reference: Reference, every: float, controller: LoopController, band: float) -> None:
         rate = case.motion.rate
         n = case.motion.n
         self.controller = controller

@@ -25,7 +25,7 @@ import scipy.linalg
 from calib.data.signals.filtering import Decimator, kept
 from calib.dynamics import drives
 from calib.dynamics.drives import DriveTerm
-from calib.dynamics.shapes import STEPS, JointRange
+from calib.dynamics.shapes import STEPS, RecordedRange
 from calib.dynamics.torque_rows import MOTOR, TorqueRows
 from calib.errors import UsageError, one_of
 from calib.identification.prior import TEMPERING, Prior
@@ -376,7 +376,7 @@ def _terms(candidates: FrictionCandidates, names: Sequence[str]) -> dict[str, li
         edge = float(np.quantile(speed, 0.98))
         fastest = float(speed.max())
         travel = float(np.ptp(position))
-        joint_range = JointRange(v0, edge, fastest, travel)
+        joint_range = RecordedRange(v0, edge, fastest, travel)
         if joint_range.peak <= 0.0:
             continue
         for name in names:

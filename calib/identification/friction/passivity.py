@@ -6,7 +6,7 @@ import numpy as np
 
 from calib.data.signals.motion import moving
 from calib.dynamics.drives import DriveTerm
-from calib.dynamics.shapes import Joined
+from calib.dynamics.shapes import TermMotion
 from calib.errors import refuse_data
 from calib.identification.prediction import Dynamics
 from calib.identification.rows import Case, term_columns
@@ -76,7 +76,7 @@ def braking(terms: Sequence[DriveTerm | None], fastest: np.ndarray) -> np.ndarra
         v = np.concatenate([-speeds, speeds])
         zero = np.zeros_like(v)
         one_sign = np.ones_like(v)
-        motion = Joined(zero, v, zero, one_sign, None)
+        motion = TermMotion(zero, v, zero, one_sign, None)
         power = np.zeros((len(v), p))
         for column, term in group_terms:
             power[:, column] = term.values(motion) * np.sign(v)

@@ -27,7 +27,7 @@ import numpy as np
 
 from calib.data.signals.filtering import low_pass
 from calib.dynamics.drives import DriveTerm
-from calib.dynamics.shapes import Joined
+from calib.dynamics.shapes import TermMotion
 from calib.identification.rows import Case, segments
 from calib.records import frozen
 
@@ -322,7 +322,7 @@ def _columns(track: GearTravel, wave: Wave, nodes: Sequence[float]) -> np.ndarra
     gear = wave[0]
     q = track.q[:, gear]
     v = track.v[:, gear]
-    motion = Joined(q, v, np.zeros_like(q))
+    motion = TermMotion(q, v, np.zeros_like(q))
     wave_terms = [term.values(motion) for term in _terms(gear, (wave,), nodes, None)]
     return np.stack(wave_terms, axis=1)
 

@@ -14,7 +14,6 @@ import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from inspect import signature
-from typing import Any
 
 import numpy as np
 
@@ -154,7 +153,7 @@ def make_curved(constraint: CurvedConstraint, row: Callable[[Mapping[str, float]
     text = str(h)
     tree, names = _parsed(text, location)
 
-    def value(u: np.ndarray) -> Any:
+    def value(u: np.ndarray) -> float:
         return evaluated(tree, _KNOWN | dict(zip(names, u)), _OPERATIONS)
 
     # by complex steps, without rounding (Squire & Trapp 1998)

@@ -26,7 +26,7 @@ from calib.identification.closed_loop.simulation import (
     plant_of,
     sample_ticks,
 )
-from calib.identification.loop import Controller
+from calib.identification.loop import LoopController
 from calib.identification.methods.method import IdentificationProblem, Method
 from calib.identification.rows import Case
 from calib.records import frozen, shaped
@@ -53,7 +53,7 @@ class Sensitivities:
 
 def simulate_tangents(
     plant: Plant,
-    controller: Controller,
+    controller: LoopController,
     reference: Reference,
     columns: np.ndarray,
     every: float = 1,
@@ -127,7 +127,12 @@ def simulate_tangents(
 
 
 def simulate_differences(
-    plant: Any, controller: Controller, reference: Reference, columns: np.ndarray, steps: np.ndarray, every: float = 1
+    plant: Any,
+    controller: LoopController,
+    reference: Reference,
+    columns: np.ndarray,
+    steps: np.ndarray,
+    every: float = 1,
 ) -> Sensitivities:
     """Return what `simulate_tangents` does of a robot without tangents, by one more simulation per parameter.
 
@@ -244,7 +249,7 @@ class BelievedRobot:
         self,
         values: np.ndarray,
         case: Case,
-        controller: Controller,
+        controller: LoopController,
         reference: Reference,
         every: float,
         relative: np.ndarray | None = None,

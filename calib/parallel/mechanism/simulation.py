@@ -21,7 +21,7 @@ from calib.dynamics.drives import DriveTerm
 from calib.errors import CannotSimulate, UsageError, require
 from calib.identification.closed_loop.controllers import Reference
 from calib.identification.closed_loop.simulation import Sensing, SimulatedRun, failure, sample_ticks
-from calib.identification.loop import Controller
+from calib.identification.loop import LoopController
 from calib.parallel.mechanism.closure import compiled
 from calib.parallel.mechanism.velocities import loop_jacobians
 from calib.records import frozen
@@ -73,7 +73,7 @@ class ParallelPlant:
 
     def run(
         self,
-        controller: Controller,
+        controller: LoopController,
         reference: Reference,
         sensing: Sensing | None = None,
         seed: int | np.random.Generator = 0,

@@ -20,7 +20,7 @@ from calib.identification.prediction import Dynamics
 from calib.identification.rows import Case
 from calib.identification.uncertainty.torque_errors import TorqueErrorModel, TorqueIntervals, read_uncertainty
 from calib.procedure.dynamic_stage import geometry_tables
-from calib.procedure.dynamic_stage.identify import Assessment, IdentificationOutcome, ModelFindings
+from calib.procedure.dynamic_stage.identify import DynamicsAssessment, IdentificationOutcome, ModelFindings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.metrics import ModelMetrics, UnseenReport, metrics, on_bounds, with_current_keys
 from calib.procedure.dynamic_stage.verdict import Resting
@@ -130,7 +130,7 @@ class UnseenFolder:
 
     report = folders.InFolder(folders.REPORT)  # scores, verdict, and curves for the certificate
 
-    def write(self, inputs: IdentificationInputs, assessment: Assessment) -> None:
+    def write(self, inputs: IdentificationInputs, assessment: DynamicsAssessment) -> None:
         """Write a table of torques per unseen recording, and the report."""
         for number, case in enumerate(inputs.unseen, 1):
             predicted, intervals = assessment.predictions[case.name], assessment.intervals.get(case.name)

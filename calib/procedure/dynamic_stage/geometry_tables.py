@@ -50,7 +50,7 @@ class TiltEffect:
 
 
 @dataclass(frozen=True)
-class ParameterChange:
+class CalibrationChange:
     """Change of a parameter from the nominal to the calibrated geometry, in its total σ and in percent."""
 
     name: str
@@ -77,7 +77,7 @@ class GeometryMetrics:
     moved_by_1_mrad_of_tilt: TiltEffect
     geometry_exceeds_torque: tuple[str, ...] = ()
     largest_growth_of_sigma: float = 1.0
-    largest_changes_from_nominal: tuple[ParameterChange, ...] = ()
+    largest_changes_from_nominal: tuple[CalibrationChange, ...] = ()
 
 
 class TwoGeometries(NamedTuple):
@@ -251,11 +251,11 @@ def _per_sigma(carried: GeometryUncertainty) -> np.ndarray:
     return np.divide(np.abs(carried.sensitivity), sigma, out=np.zeros(carried.sensitivity.shape), where=sigma > 0.0)
 
 
-def _largest(comparison: GeometryComparison) -> tuple[ParameterChange, ...]:
+def _largest(comparison: GeometryComparison) -> tuple[CalibrationChange, ...]:
     """Return the five parameters that differ most between the geometries, with the differences in total σ and [%]."""
     nominal, calibrated = comparison.values
     _, sigma = comparison.sigma
     size = (nominal - calibrated) / np.where(sigma > 0.0, sigma, np.inf)
     names, relative = comparison.names, comparison.relative
     largest = np.argsort(-np.abs(size))[:MAX_CHANGES]
-    return tuple(ParameterChange(names[k], float(size[k]), float(relative[k])) for k in largest)
+    return tuple(CalibrationChange(names[k], float(size[k]), float(relative[k])) for k in largest)

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from os.path import realpath
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from calib.dynamics.regressor_model import RegressorModel
 from calib.errors import Finding, finding
 from calib.identification.friction.passivity import driven
 from calib.identification.identify import Identification, identify
-from calib.identification.loop import Controller, LoopDisagreement, Replay
+from calib.identification.loop import LoopController, LoopDisagreement, Replay
 from calib.identification.physical_consistency.solve import Contradiction, contradiction
 from calib.identification.prediction import Dynamics, Score, predict, score
 from calib.identification.rows import Case
@@ -53,7 +53,7 @@ class ModelFindings:
     rests: judging.Resting
     notes: tuple[str, ...] = ()
     noticed: tuple[Finding, ...] = ()
-    controller: Controller | None = None
+    controller: LoopController | None = None
     errors: torque_errors.TorqueDiscrepancy | None = None
     contradiction: Contradiction | None = None
     unlike: LoopDisagreement | None = None
@@ -61,7 +61,7 @@ class ModelFindings:
 
 
 @dataclass(frozen=True, eq=False)
-class Errors:
+class RecordingErrors:
     """Errors of a model on the recordings.
 
     Attributes:
@@ -86,7 +86,7 @@ class Errors:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Assessment(Errors):
+class DynamicsAssessment(RecordingErrors):
     """Errors of a model on the recordings, and the verdict.
 
     Attributes:
@@ -134,7 +134,7 @@ def errors_of(
     dynamics: Dynamics[RegressorModel],
     errors: torque_errors.TorqueErrorModel | None = None,
     say: Progress = silent,
-) -> Errors:
+) -> RecordingErrors:
     """Return the predictions of every recording by a model, and their errors.
 
     Args:
@@ -149,14 +149,16 @@ def errors_of(
     if errors is not None:
         for case in inputs.unseen or inputs.cases[:1]:
             say(f"estimating the errors of {case.name}")
-            intervals[case.name] = torque_errors.intervals(errors, dynamics, case, predictions[case.name])
+            intervals[case.name] = torque_errors.intervals(
+                errors, cast(Dynamics, dynamics), case, predictions[case.name]
+            )
     repeated = repeated_motion(inputs.cases, inputs.unseen)
     validation = {}
     for case in inputs.unseen:
         coverage = intervals[case.name].coverage() if case.name in intervals else None
         evidence = case.name not in repeated
         validation[case.name] = replace(scores[case.name], evidence=evidence, interval95=coverage)
-    return Errors(
+    return RecordingErrors(
         fit={case.name: scores[case.name] for case in inputs.cases},
         validation=validation,
         predictions=predictions,
@@ -173,7 +175,7 @@ def assess(
     errors: torque_errors.TorqueErrorModel | None = None,
     wrong: Sequence[int] | None = None,
     progress: Progress | None = None,
-) -> Assessment:
+) -> DynamicsAssessment:
     """Return the predictions of every recording by a model, their errors, and the verdict.
 
     Args:
@@ -236,7 +238,7 @@ def assess(
         noticed += judging.extrapolates(case.name, scored.intervals.get(case.name))
     noticed += findings.noticed
     warnings = dict.fromkeys((*lines_of(noticed), *judging.excitation_notes(scored.excitation), *findings.notes))
-    return Assessment(
+    return DynamicsAssessment(
         fit=scored.fit,
         validation=scored.validation,
         predictions=scored.predictions,
@@ -253,7 +255,7 @@ def assess(
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class IdentificationOutcome(Assessment):
+class IdentificationOutcome(DynamicsAssessment):
     """Outcome of an identification: the model, its errors on the recordings, its verdict, and its inputs.
 
     Attributes:

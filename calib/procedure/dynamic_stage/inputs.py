@@ -27,7 +27,7 @@ from calib.identification.rows import Case, case_names, make_case
 from calib.identification.settings import IdentificationSettings
 from calib.procedure.dynamic_stage.gains import FoundGains, find_gains
 from calib.procedure.robot_kinds import Mechanism, joints_of
-from calib.records import frozen
+from calib.records import FieldValues, frozen
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain
 from calib.robot.description import remarks
@@ -236,7 +236,7 @@ def _path(recording: str | Path | Recording) -> str:
 
 def _with_choices(options: IdentifyOptions, method: str | None, friction: str | None, seed: int) -> IdentifyOptions:
     """Return the options with the command's method, friction model and seed; refuse unknown names."""
-    choices: dict[str, Any] = {"seed": seed}
+    choices: FieldValues = {"seed": seed}
     if method is not None:
         _check_choice("method", method, tuple(METHODS))
         choices["method"] = method

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -26,10 +25,10 @@ from calib.identification.prediction import Score, relative_error_sigma
 from calib.identification.registry import METHODS
 from calib.identification.rows import Case
 from calib.procedure.dynamic_stage import geometry_tables
-from calib.procedure.dynamic_stage.identify import Assessment, IdentificationOutcome, ModelFindings
+from calib.procedure.dynamic_stage.identify import DynamicsAssessment, IdentificationOutcome, ModelFindings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.plain import PlainReferences
-from calib.records import Array, Number, Unbounded, evenly
+from calib.records import Array, FieldValues, Number, Unbounded, evenly
 from calib.units import TORQUE
 
 # of metrics.json, and of unseen/report.json
@@ -117,7 +116,7 @@ class JudgedMetrics:
     references: Mapping[str, PlainReferences] = field(default_factory=dict)
 
 
-def _judged(assessment: Assessment) -> dict[str, Any]:
+def _judged(assessment: DynamicsAssessment) -> FieldValues:
     """Return the entries of an assessment common to both records, without the names of the rows."""
     return {
         "verdict": assessment.verdict.level,
@@ -276,7 +275,7 @@ class UnseenReport(JudgedMetrics):
     schema: int = UNSEEN_SCHEMA
 
     @classmethod
-    def of(cls, inputs: IdentificationInputs, assessment: Assessment) -> UnseenReport:
+    def of(cls, inputs: IdentificationInputs, assessment: DynamicsAssessment) -> UnseenReport:
         """Return the report of an assessment."""
         torque_rows = inputs.options.settings.torque_rows
         rows = torque_rows.titles(inputs.chain.joint_names)

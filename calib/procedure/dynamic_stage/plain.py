@@ -61,8 +61,9 @@ def plain_values(identification: Identification[RegressorModel]) -> np.ndarray:
     result[: len(standard)] = standard
     estimated = np.zeros(len(result), dtype=bool)
     estimated[base.kept] = True
-    if hasattr(dynamics.model, "bodies"):
-        for number, label in enumerate(dynamics.model.bodies.labels):
+    bodies = getattr(dynamics.model, "bodies", None)
+    if bodies is not None:
+        for number, label in enumerate(bodies.labels):
             body = slice(BODY_PARAMETERS * number, BODY_PARAMETERS * (number + 1))
             if label in identification.settings.payloads and not estimated[body].any():
                 result[body] = dynamics.values[body]

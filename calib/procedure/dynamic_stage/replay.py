@@ -33,7 +33,7 @@ from calib.errors import CalibError, require
 from calib.identification.closed_loop.controllers import Reference, pd, stated_controller
 from calib.identification.closed_loop.loop_recordings import periods_per_sample, take
 from calib.identification.closed_loop.simulation import Plant, feed_forward, tracking_error
-from calib.identification.loop import CAD, DAMPING, FEEDBACK, FLOOR, FREQUENCY, IDENTIFIED, Controller, Replay
+from calib.identification.loop import CAD, DAMPING, FEEDBACK, FLOOR, FREQUENCY, IDENTIFIED, LoopController, Replay
 from calib.identification.prediction import Dynamics
 from calib.identification.rows import Case, segments
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
@@ -56,7 +56,7 @@ def replay(
     dynamics: Dynamics,
     case: Case,
     predicted: np.ndarray,
-    controller: Controller | None = None,
+    controller: LoopController | None = None,
     rate: float | None = None,
 ) -> Replay:
     """Return the tracking errors on a recorded motion with three feedforwards: none, the CAD model, and the model.
@@ -164,7 +164,7 @@ def _smoothed(term: DriveTerm, value: float, size: np.ndarray, reference: Refere
     return replace(term, settings=(*settings, max(v0, min_v0)))
 
 
-def _default(robot: Plant, reference: Reference) -> Controller:
+def _default(robot: Plant, reference: Reference) -> LoopController:
     omega = 2.0 * np.pi * FREQUENCY
     inertia = robot.inertia_diagonal(reference.q[::200])
     return pd(omega**2 * inertia, 2.0 * DAMPING * omega * inertia)
@@ -174,7 +174,7 @@ def track(
     inputs: IdentificationInputs,
     dynamics: Dynamics,
     predictions: Mapping[str, np.ndarray],
-    controller: Controller | None = None,
+    controller: LoopController | None = None,
 ) -> tuple[dict[str, Replay], str]:
     """Return the replays by name, of unseen recordings or else of a training recording, or the reason for none.
 

@@ -32,7 +32,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from annotated_types import MinLen
@@ -46,6 +46,7 @@ from calib.data.schema import Joints
 from calib.data.signals.resampling import resample
 from calib.errors import MeasurementError, UsageError, refused_as, require
 from calib.folders import METRICS
+from calib.records import FieldValues
 from calib.result_kinds import refusal
 from calib.trajectories.bspline import bspline_family
 from calib.trajectories.errors import BadInput
@@ -278,7 +279,7 @@ def write(averaged: AveragedMotion, out: Path) -> Path:
             header += headings(letters[name], joints)
         means = [series.mean for series in averages.values()]
         return files.write_numbers(out, header, np.column_stack([t, *means]))
-    arrays: dict[str, Any] = {letters[name]: series.mean for name, series in averages.items()}
+    arrays: FieldValues = {letters[name]: series.mean for name, series in averages.items()}
     for name, series in averages.items():
         arrays[f"variance_{letters[name]}"] = series.variance
     arrays["t"] = t

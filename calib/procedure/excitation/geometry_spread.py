@@ -17,7 +17,7 @@ from calib.robot.chain import Chain
 
 @dataclass(frozen=True, eq=False)
 class GeometrySpread:
-    """Errors of a geometry, see `calib.procedure.excitation.prior_motions.GeometrySpread`.
+    """Errors of a geometry, see `calib.procedure.excitation.prior_motions.PrincipalErrors`.
 
     Attributes:
         moved: r pairs of models, on the geometry with +g_i and with -g_i.

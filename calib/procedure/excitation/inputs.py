@@ -14,7 +14,7 @@ from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.excitation.excited_model import ExcitedModel, check_held, read_model
 from calib.procedure.excitation.geometry_spread import geometry_spread
 from calib.procedure.excitation.limits import MotionLimits, read_motion_limits
-from calib.procedure.excitation.prior_motions import GeometrySpread, PriorMotions, designed_orders, read_prior
+from calib.procedure.excitation.prior_motions import PrincipalErrors, PriorMotions, designed_orders, read_prior
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.kinematic_stage.inputs import load_rigid
 from calib.robot.calibrated import CalibratedChain
@@ -84,7 +84,7 @@ class ExcitationInputs:
     locked: Mapping[int, float | None]
     columns: IdentifiableColumns
     prior: PriorMotions | None
-    geometry: GeometrySpread | None = None
+    geometry: PrincipalErrors | None = None
     source: str = ""
 
     @property

@@ -28,7 +28,7 @@ MIN_SAMPLES = 1000
 MIN_RATE = 50
 
 
-class GeometrySpread(Protocol):
+class PrincipalErrors(Protocol):
     """Principal errors of a calibrated geometry, g_1 … g_r: √λ_i u_i of its covariance Σ λ_i u_i u_iᵀ."""
 
     @property
@@ -68,7 +68,7 @@ def read_prior(
     chain: Chain,
     after: Path | None = None,
     noise: np.ndarray | None = None,
-    geometry: GeometrySpread | None = None,
+    geometry: PrincipalErrors | None = None,
 ) -> PriorMotions | None:
     """Return the information from recordings (``log.npz@0:9.4`` cuts) and folders of `calib excite`; None if none.
 
@@ -107,7 +107,7 @@ def read_prior(
 
 
 def _identified_information(
-    folder: Path, model: ExcitedModel, geometry: GeometrySpread | None
+    folder: Path, model: ExcitedModel, geometry: PrincipalErrors | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the information (b, b) of an identification, and the square root of its torque error density (rows,).
 

@@ -7,7 +7,6 @@ YAML 1.1 takes 1e-05 for text; a key that could be read as something else is quo
 import json
 import re
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,7 +18,7 @@ _PLAIN = re.compile(r"[A-Za-z_][\w./-]*", re.ASCII)
 _WORDS = {"yes", "no", "on", "off", "true", "false", "null"}  # no texts in YAML 1.1, in any case
 
 
-def block(value: Mapping[str, Any], indent: str = "") -> str:
+def block(value: Mapping[str, object], indent: str = "") -> str:
     """Return the YAML lines of a mapping from texts to mappings, texts and finite floats."""
     lines = []
     for key, item in value.items():

@@ -16,7 +16,7 @@ from calib.geometry.repeatability import ARMS, RepeatedPoses, repeated_poses
 from calib.geometry.weighing import Settings
 from calib.procedure.kinematic_stage.image_findings import reprojection
 from calib.procedure.kinematic_stage.inputs import Unseen, pose_count
-from calib.procedure.kinematic_stage.metrics import ComparedRows, IntervalCoverage
+from calib.procedure.kinematic_stage.metrics import ComparedRows, PoseIntervalCoverage
 
 # Columns of unseen rows: the standard deviation that the fit expects of the calibrated arm's position error there, all
 # axes together; the radius within which 95 % of such errors are to be; 1 where a joint is outside the range learnt from
@@ -57,9 +57,9 @@ class Intervals:
         return float(np.mean(self.size <= self.radius))
 
     @property
-    def record(self) -> IntervalCoverage:
+    def record(self) -> PoseIntervalCoverage:
         """Coverage and median radius of the 95 % intervals, and the number of rows that extrapolate."""
-        return IntervalCoverage(
+        return PoseIntervalCoverage(
             coverage_percent=100.0 * self.covered,
             median_mm=1e3 * float(np.median(self.radius)),
             sigma_rms_mm=1e3 * float(np.sqrt(np.mean(self.sigma**2))),

@@ -17,7 +17,7 @@ SCHEMA = 3
 
 
 @dataclass(frozen=True)
-class IntervalCoverage:
+class PoseIntervalCoverage:
     """Share of errors within the fit's 95 % interval, interval width, and number of rows that extrapolate."""
 
     coverage_percent: float
@@ -57,7 +57,7 @@ class ComparedRows:
     iso9283: RepeatedPoses | None = None
     unseen: bool = True
     parameters: int = 0
-    interval95: IntervalCoverage | None = None
+    interval95: PoseIntervalCoverage | None = None
     reprojection_px: Mapping[str, float] = field(default_factory=dict)
     plain: ArmErrors | None = None
     position_means: str = "position"

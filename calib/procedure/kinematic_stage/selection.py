@@ -28,7 +28,7 @@ from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, Selectio
 from calib.procedure.measuring import prediction as forecast
 from calib.procedure.measuring.pose_limits import Limits, read_limits
 from calib.procedure.measuring.prediction import Prediction, SelectionPrediction
-from calib.procedure.measuring.run import Drivable, Exchange, Run, RunSettings, drivable
+from calib.procedure.measuring.run import Drivable, Exchange, MeasuringRun, RunSettings, drivable
 from calib.procedure.measuring.run import lines as run_lines
 from calib.procedure.robot_kinds import joints_of
 from calib.robot.calibrated import CalibratedChain
@@ -89,7 +89,7 @@ class Chosen:
     unchecked: tuple[str, ...]
     notes: tuple[str, ...]
     outlook: PoseOutlook
-    run: Run
+    run: MeasuringRun
     driven: RunSettings
     by_images: bool
 

@@ -5,11 +5,13 @@ between the arm's own links, and the floor that the arm stands on: `Limits.check
 `Limits.unchecked` names what could not be, since nobody has stated it.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,7 +19,7 @@ from calib.config import Tables, check_keys, read
 from calib.config_types import number
 from calib.errors import RobotError, UsageError, listing, one_of, refused_as, require
 from calib.geometry.installation import Installation
-from calib.geometry.observability import Observation, Target, TargetJacobian
+from calib.geometry.observability import Observation, TargetJacobian, TargetPose
 from calib.poses import constraints
 from calib.poses.space import PoseConstraint, SearchSpace
 from calib.procedure.measuring import constraints_file
@@ -25,8 +27,8 @@ from calib.procedure.measuring.camera_view import camera_view
 from calib.procedure.measuring.constraints_file import CameraTable, CollisionTable, ConstraintsFile, InstrumentTable
 from calib.procedure.measuring.moveit import limit_tables
 from calib.procedure.measuring.sight import SeenOnly, Sight, sight_of
+from calib.records import FieldValues
 from calib.robot.beside import links_of
-from calib.robot.capsules import DistanceModel
 from calib.robot.chain import Chain
 from calib.robot.description import MAX_TURN, remarks
 from calib.robot.formats.urdf_tree import is_urdf, text
@@ -34,6 +36,9 @@ from calib.robot.formats.urdf_tree import read as read_tree
 from calib.robot.obstacles import Obstacle, Wall, signed_distance
 from calib.robot.tables import load as load_table
 from calib.robot.tables import placement
+
+if TYPE_CHECKING:
+    from calib.robot.collision import DistanceModel
 
 # times the arm's reach: no cell is that large (our choice)
 MAX_REACHES = 100.0
@@ -295,7 +300,7 @@ def _span(value: tuple[object, object], where: str, quantity: str) -> tuple[floa
 
 def _target(settings: ConstraintsFile, cell: Installation) -> list[PoseConstraint]:
     table = settings.target
-    target = Target(cell)
+    target = TargetPose(cell)
     jacobian = TargetJacobian(cell)
     result = []
     low, high = table.heights
@@ -315,7 +320,7 @@ def _orientation(settings: ConstraintsFile, cell: Installation, where: str) -> l
     stand = placement(table.stated, where)
     roll = _span(table.roll or (-np.pi, np.pi), f"{where}.roll", "angle")
     pitch = _span(table.pitch or (-np.pi / 2, np.pi / 2), f"{where}.pitch", "angle")
-    return [constraints.orientation(Target(cell), stand[:3, :3], roll, pitch, TargetJacobian(cell))]
+    return [constraints.orientation(TargetPose(cell), stand[:3, :3], roll, pitch, TargetJacobian(cell))]
 
 
 def _sight(settings: ConstraintsFile, cell: Installation, where: str, model: DistanceModel | None) -> Sight | None:
@@ -438,7 +443,7 @@ def _model(
             one_of(name, links, "collision.ignored: link", RobotError)
     posture = _posture(table.posture, chain, source)
     posture_name = "the stated posture" if posture else "zero of their joints"
-    common: dict[str, Any] = {
+    common: FieldValues = {
         "walls": walls,
         "targets": cell.tools[:, :3, 3],
         "margin": table.margin,

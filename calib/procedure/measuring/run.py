@@ -13,12 +13,14 @@ joints comes first. Of the candidates the one is taken that leaves most of the c
 move reaches, or, where there are none, among the best few by via-points.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise, product
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -28,10 +30,12 @@ from calib.poses.by_index import merits
 from calib.poses.indices import Index, observability
 from calib.poses.information import log_det
 from calib.procedure.measuring import DEFAULT_RUN, RunSettings
-from calib.robot.capsules import DistanceModel
 from calib.robot.chain import Chain
 from calib.trajectories.tour import move_times, tour
 from calib.trajectories.ways import Room, way
+
+if TYPE_CHECKING:
+    from calib.robot.collision import DistanceModel
 
 Progress = Callable[[str], None]
 # by the numbers of two poses, the smaller one first
@@ -99,7 +103,7 @@ def _silent(stage: str) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class MeasuringRun:
     """A run through m poses: order, paths between poses, and times.
 
     Attributes:
@@ -156,7 +160,7 @@ def plan_run(
     seed: int = 0,
     progress: Progress | None = None,
     clear: Ways | None = None,
-) -> Run:
+) -> MeasuringRun:
     """Return the run through poses q (m, n) [rad or m]: their order, and the paths between them.
 
     Where an order is left with a pair that no clear way was found for, the ways found so far serve: from one pose to
@@ -168,7 +172,7 @@ def plan_run(
         settings: speed and dwell.
         seed: of the search for ways around.
         progress: called with a few words now and then.
-        clear: clear ways from an earlier run, see `Run.found_ways`; those between other postures are left out.
+        clear: clear ways from an earlier run, see `MeasuringRun.found_ways`; those between other postures are left out.
     """
     show = progress or _silent
     velocity, acceleration = _speeds(chain, settings.speed)
@@ -218,7 +222,7 @@ def plan_run(
         paths.append(path)
         if len(path) > 2:
             around += 1
-    return Run(
+    return MeasuringRun(
         order=order,
         ways=tuple(paths),
         times=np.array([duration(path) for path in paths]),
@@ -336,7 +340,7 @@ def _clear_at_places(room: Room, q: np.ndarray) -> np.ndarray:
     return clear
 
 
-def lines(run: Run, settings: RunSettings) -> list[str]:
+def lines(run: MeasuringRun, settings: RunSettings) -> list[str]:
     """Return the lines on a run: duration, paths around obstacles, and poses without a clear path."""
     minutes, before = run.seconds / 60, run.found / 60
     result = [
@@ -351,7 +355,7 @@ def lines(run: Run, settings: RunSettings) -> list[str]:
     return result
 
 
-def write_run(path: Path, run: Run, chain: Chain) -> Path:
+def write_run(path: Path, run: MeasuringRun, chain: Chain) -> Path:
     """Write the file of a run (format: see the module), its poses numbered in visiting order."""
     header, factors = joint_columns(chain.joint_names, [joint.kind for joint in chain.joints])
     velocity, acceleration = _speeds(chain, 1.0)
@@ -461,7 +465,7 @@ class Drivable:
     """
 
     q: np.ndarray
-    run: Run
+    run: MeasuringRun
     replaced: Mapping[int, int]
     value: tuple[float, float]
     gain: float
@@ -516,7 +520,13 @@ def drivable(
 
 
 def _rejoined(
-    chain: Chain, q: np.ndarray, run: Run, exchange: Exchange, limits: MoveLimits, settings: RunSettings, seed: int
+    chain: Chain,
+    q: np.ndarray,
+    run: MeasuringRun,
+    exchange: Exchange,
+    limits: MoveLimits,
+    settings: RunSettings,
+    seed: int,
 ) -> tuple[np.ndarray, dict[int, int], Ways]:
     """Return the poses (m, n) with unreachable ones replaced, the replacements (place -> candidate), and all paths."""
     q = q.copy()

@@ -4,17 +4,23 @@ With several targets (reflectors on one plate, each with a direction of its own)
 and only the rows of those that are seen count in the observation Jacobian: what faces away counts for nothing.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from calib.geometry.installation import Installation
-from calib.geometry.observability import Observation, Target, TargetJacobian
+from calib.geometry.observability import Observation, TargetJacobian, TargetPose
 from calib.poses import constraints
 from calib.poses.space import PoseConstraint, constraint_gradient
-from calib.robot.capsules import ALWAYS, SAMPLES, DistanceModel
+from calib.robot.capsules import ALWAYS, SAMPLES
 from calib.robot.chain import Chain, random_joints
+
+if TYPE_CHECKING:
+    from calib.robot.collision import DistanceModel
 
 # distance [m] of a link from the line of sight below which it blocks it: about a tracker beam's radius (our choice)
 BEAM = 0.01
@@ -35,7 +41,7 @@ class _Behind:
     """
 
     arm: DistanceModel
-    target: Target
+    target: TargetPose
     velocity: TargetJacobian
     instrument: np.ndarray
     links: np.ndarray
@@ -147,7 +153,7 @@ def sight_of(
     nearest, largest = span
     targets = []
     for number, direction in enumerate(directions):
-        target = Target(cell, number)
+        target = TargetPose(cell, number)
         velocity = TargetJacobian(cell, number)
         parts: list[PoseConstraint] = []
         if half_angle is not None:
@@ -164,7 +170,7 @@ def sight_of(
     return Sight(tuple(targets))
 
 
-def _blocking_links(arm: DistanceModel, chain: Chain, target: Target) -> np.ndarray:
+def _blocking_links(arm: DistanceModel, chain: Chain, target: TargetPose) -> np.ndarray:
     """Return the indices of links that can block the view: all except those next to the target in every posture."""
     q = random_joints(chain, SAMPLES)
     position = target(q)[1]

@@ -101,7 +101,7 @@ def bars(
     """Draw bars (k,) from `base` at 0, 1, …, in one colour or one each; `spread` (k,): half the error bars' length."""
     values = np.asarray(values, dtype=float)
     position = np.arange(len(values)) + shift
-    options: Any = {"color": colours, "label": label}
+    options: dict[str, Any] = {"color": colours, "label": label}
     if spread is not None:
         direction = "yerr" if upright else "xerr"
         options |= {direction: spread, "ecolor": MARK, "capsize": 1.8, "error_kw": {"elinewidth": 0.9}}
@@ -237,7 +237,7 @@ def box(axes: Axes, values: ArrayLike, place: float, colour: str = AFTER) -> Non
 
 def _scale(axes: Axes, mappable: ScalarMappable, unit: str, **options: Any) -> None:
     """Draw the colour bar of a layer, with its unit."""
-    figure: Any = axes.get_figure()
+    figure = axes.figure
     scale = figure.colorbar(mappable, ax=axes, pad=0.02, aspect=30, **options)
     scale.ax.set_title(unit, fontsize=7.0, fontweight="normal")
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.dynamics.drives import DriveTerm
-from calib.dynamics.shapes import Joined
+from calib.dynamics.shapes import TermMotion
 from calib.dynamics.torque_rows import MOTOR
 from calib.estimation.whiteness import Whiteness
 from calib.procedure.dynamic_stage.geometry_tables import GEOMETRIES, MIN_SHIFT, GeometricEffect, TwoGeometries
@@ -128,7 +128,7 @@ def friction(outcome: IdentificationOutcome) -> dict[str, Chart]:
 def _friction(column: DriveTerm, velocity: np.ndarray) -> np.ndarray:
     """Return the values (N,) of a term of friction at velocities (N,), at position and acceleration zero."""
     zero = np.zeros(len(velocity))
-    return column.values(Joined(zero, velocity, zero))
+    return column.values(TermMotion(zero, velocity, zero))
 
 
 def torques(

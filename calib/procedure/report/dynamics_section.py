@@ -214,7 +214,7 @@ def report_section(
     return page.Section("Dynamics", blocks, unseen.verdict, unseen.reason, key_figures)
 
 
-def _parameter_table(estimate: Sequence[IdentifiedParameter]) -> page.Table:
+def _parameter_table(estimate: Sequence[IdentifiedParameter]) -> page.ReportTable:
     """Return the table of identified parameters."""
     header = ("parameter", "unit", "value", "σ", "RSD", "what it holds")
     rows = []
@@ -224,7 +224,7 @@ def _parameter_table(estimate: Sequence[IdentifiedParameter]) -> page.Table:
         expression = page.shortened(parameter.expression, EXPRESSION_LETTERS)
         rows.append([parameter.name, parameter.unit, f"{parameter.value:.4g}", sigma, rsd, expression])
     note = "R marks parameters that include others by regrouping; complete table: 8-dynamics/estimate.csv."
-    return page.Table("Identified parameters", header, rows, note, numbers=[2, 3, 4])
+    return page.ReportTable("Identified parameters", header, rows, note, numbers=[2, 3, 4])
 
 
 def warnings_of(report: DynamicReport) -> list[str]:
@@ -294,7 +294,7 @@ def _rsd(percent: float) -> str:
     return f"{percent:.0f} %" if percent < 1000.0 else "above 1000 %"
 
 
-def _error_table(unseen: UnseenReport) -> page.Table:
+def _error_table(unseen: UnseenReport) -> page.ReportTable:
     """Return the table of torque errors, per row and recording."""
     groups = {}
     for name, score in unseen.fit.items():
@@ -332,7 +332,7 @@ def _of_all(row: Sequence[str]) -> bool:
     return row[0] == "all"
 
 
-def _reference_table(unseen: UnseenReport) -> page.Table:
+def _reference_table(unseen: UnseenReport) -> page.ReportTable:
     """Return the table of errors of plain references on held-out motion beside the model's; may be empty."""
     header = ("recording", "nominal masses, no friction", "plain least squares", "this model")
     rows = []
@@ -340,10 +340,10 @@ def _reference_table(unseen: UnseenReport) -> page.Table:
         errors = references.nominal, references.plain, references.delivered
         rows.append([recording, *map(percent, errors)])
     title = "Beside plain references: torque unexplained on held-out motion"
-    return page.Table(title, header, rows, REFERENCE_NOTE, numbers=[1, 2, 3])
+    return page.ReportTable(title, header, rows, REFERENCE_NOTE, numbers=[1, 2, 3])
 
 
-def _interval_table(unseen: UnseenReport) -> page.Table:
+def _interval_table(unseen: UnseenReport) -> page.ReportTable:
     """Return the table of the coverage of predicted 95 % intervals, per row of unseen recordings; may be empty."""
     groups = {}
     for name, score in unseen.validation.items():
@@ -365,7 +365,7 @@ def _interval_table(unseen: UnseenReport) -> page.Table:
     return page.grouped("Intervals stated", INTERVAL_HEADER, groups, strong=_of_all)
 
 
-def _friction_table(metrics: ModelMetrics) -> page.Table:
+def _friction_table(metrics: ModelMetrics) -> page.ReportTable:
     """Return the table of friction models with their errors on held-out time, for all rows and for each row."""
     count = max(len(step.joints_percent) for step in metrics.ladder)
     joints = [str(j + 1) for j in range(count)]
@@ -382,7 +382,7 @@ def _friction_table(metrics: ModelMetrics) -> page.Table:
             strong.add(k)
     title = "Ladder of friction models: relative error on held-out time [%]"
     numbers = range(1, len(header) - 1)
-    return page.Table(title, header, rows, f"Chosen: {metrics.friction}.", frozenset(strong), list(numbers))
+    return page.ReportTable(title, header, rows, f"Chosen: {metrics.friction}.", frozenset(strong), list(numbers))
 
 
 def _rounded(share: float, digits: int) -> str:
@@ -472,7 +472,7 @@ def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.Ge
     return blocks
 
 
-def _effect_table(effects: Sequence[geometry_tables.GeometricEffect]) -> page.Table:
+def _effect_table(effects: Sequence[geometry_tables.GeometricEffect]) -> page.ReportTable:
     """Return the table of geometric errors with the parameter that each shifts most, and its effect on the torque."""
     header = (
         "geometric error",
@@ -488,7 +488,7 @@ def _effect_table(effects: Sequence[geometry_tables.GeometricEffect]) -> page.Ta
         shift, count = f"{effect.shift_sigma:.2f}", str(effect.parameters_moved)
         torque = f"{effect.torque_rms or 0.0:.2g}"
         rows.append([effect.element, sigma, effect.parameter, shift, count, torque])
-    return page.Table("Which geometric errors matter for the dynamics", header, rows, numbers=[1, 3, 4, 5])
+    return page.ReportTable("Which geometric errors matter for the dynamics", header, rows, numbers=[1, 3, 4, 5])
 
 
 def _loop_sentences(loop: LoopMetrics) -> list[str]:

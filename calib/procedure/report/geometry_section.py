@@ -230,7 +230,7 @@ def meanings(rows: ComparedRows) -> list[str]:
     return [sentence for name, sentence in MEANS.items() if name in rows.position_means]
 
 
-def error_table(sets: Sequence[tuple[str, ComparedRows]], deliverable: str) -> page.Table:
+def error_table(sets: Sequence[tuple[str, ComparedRows]], deliverable: str) -> page.ReportTable:
     """Return the table of errors of all arms on sets of rows, with the one that is judged in bold."""
     has_corrections = any(rows.urdf_alone for _, rows in sets)
     notes = {"Distances of pairs do not depend on the placement of instrument and tool.": None}
@@ -270,7 +270,7 @@ def _error_rows(rows: ComparedRows) -> Iterator[tuple[str, ...]]:
             yield quantity if arm == "nominal" else "", names[arm], *sizes
 
 
-def _ladder_table(metrics: FitMetrics) -> page.Table:
+def _ladder_table(metrics: FitMetrics) -> page.ReportTable:
     """Return the table of the models tried, with their errors on held-out rows."""
     header = ("model", "parameters", "cross-validated rms [mm]", "remark")
     rows = []
@@ -284,17 +284,17 @@ def _ladder_table(metrics: FitMetrics) -> page.Table:
         if step.kept:
             strong.add(k)
     note = f"Chosen: {metrics.model}, {parameter_words(metrics)}."
-    return page.Table("Ladder of models", header, rows, note, frozenset(strong), [1, 2])
+    return page.ReportTable("Ladder of models", header, rows, note, frozenset(strong), [1, 2])
 
 
-def _outlier_table(metrics: FitMetrics) -> page.Table:
+def _outlier_table(metrics: FitMetrics) -> page.ReportTable:
     """Return the table of outliers, the worst first."""
     columns = (
-        page.Column("file", _file_name, number=False),
-        page.Column("row", "{0.row}"),
-        page.Column("residual", "{0.nature}", number=False),
-        page.Column("size", "{0.size}"),
-        page.Column("robust sigmas", "{0.sigmas:.1f}"),
+        page.RecordColumn("file", _file_name, number=False),
+        page.RecordColumn("row", "{0.row}"),
+        page.RecordColumn("residual", "{0.nature}", number=False),
+        page.RecordColumn("size", "{0.size}"),
+        page.RecordColumn("robust sigmas", "{0.sigmas:.1f}"),
     )
     note = "Rows beyond 4 robust sigmas. The fit includes these rows; a robust loss reduces their weight."
     return page.table("Outliers", columns, metrics.outliers, note, most=MAX_OUTLIERS)
@@ -337,7 +337,7 @@ def _rms_words(rows: ComparedRows, deliverable: str) -> str:
     return words
 
 
-def _parameter_table(report: Report) -> page.Table:
+def _parameter_table(report: Report) -> page.ReportTable:
     """Return the table of fitted parameters, without joint corrections if these are many."""
     parameters = report.parameters
     if len(report.parameters) > MAX_ROWS:
@@ -359,7 +359,7 @@ def _parameter_table(report: Report) -> page.Table:
     if report.kept:
         note = f"Not fitted, kept at their nominal values: {', '.join(report.kept)}. {note}"
     header = ("parameter", "unit", "nominal", "fitted", "change", "σ", "RSD")
-    return page.Table("Fitted parameters", header, rows, note.strip(), numbers=range(2, 7))
+    return page.ReportTable("Fitted parameters", header, rows, note.strip(), numbers=range(2, 7))
 
 
 def outlier_sentences(metrics: FitMetrics) -> list[str]:
@@ -411,17 +411,17 @@ def iso9283_words(rows: ComparedRows) -> str:
     return iso9283_sentence(rows.iso9283, ARM["corrections"] if rows.urdf_alone else ARM["urdf"])
 
 
-def iso9283_tables(metrics: FitMetrics, most: int = MAX_POSES) -> list[page.Table]:
+def iso9283_tables(metrics: FitMetrics, most: int = MAX_POSES) -> list[page.ReportTable]:
     """Return the tables of accuracy and repeatability after ISO 9283, one per set of rows with repeated poses."""
     columns = (
-        page.Column("pose", "{0[0]}", number=False),
-        page.Column("cycles", _cycles),
-        page.Column("AP nominal [mm]", _nominal_accuracy),
-        page.Column("AP after [mm]", _accuracy),
-        page.Column("AP after, x, y, z [mm]", _accuracy_by_axis),
-        page.Column("RP [mm]", "{0[1].repeatability_mm:.3f}"),
-        page.Column("RP a, b, c [deg]", _repeatability_of_angles),
-        page.Column("vAP [mm]", _multidirectional),
+        page.RecordColumn("pose", "{0[0]}", number=False),
+        page.RecordColumn("cycles", _cycles),
+        page.RecordColumn("AP nominal [mm]", _nominal_accuracy),
+        page.RecordColumn("AP after [mm]", _accuracy),
+        page.RecordColumn("AP after, x, y, z [mm]", _accuracy_by_axis),
+        page.RecordColumn("RP [mm]", "{0[1].repeatability_mm:.3f}"),
+        page.RecordColumn("RP a, b, c [deg]", _repeatability_of_angles),
+        page.RecordColumn("vAP [mm]", _multidirectional),
     )
     tables = []
     for name, rows in {"fitted": metrics.fit, **metrics.validation}.items():

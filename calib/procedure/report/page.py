@@ -22,7 +22,7 @@ COLOURS: dict[str, str] = dict(zip(LEVELS, ("green", "green", "yellow", "yellow"
 
 
 @dataclass(frozen=True)
-class Table:
+class ReportTable:
     """Table of a report: rows of text under a header.
 
     Attributes:
@@ -45,7 +45,7 @@ class Table:
         return len(self.rows)
 
 
-class Column(NamedTuple):
+class RecordColumn(NamedTuple):
     """A column of a table of records: name, format of a cell (``{0.sigma:.2g}``), and alignment."""
 
     name: str
@@ -65,12 +65,12 @@ def _never(record: object) -> bool:
 
 def table(
     title: str,
-    columns: Sequence[Column],
+    columns: Sequence[RecordColumn],
     records: Sequence[object],
     note: str = "",
     strong: Callable[..., bool] = _never,
     most: int | None = None,
-) -> Table:
+) -> ReportTable:
     """Return a table of records, one row per record up to `most`, with the `strong` ones in bold."""
     if most is not None and len(records) > most:
         note = f"{note} {len(records) - most} more in metrics.json."
@@ -83,7 +83,7 @@ def table(
         rows.append([column.of(record) for column in columns])
         if strong(record):
             bold.add(k)
-    return Table(title, header, rows, note, frozenset(bold), numbers)
+    return ReportTable(title, header, rows, note, frozenset(bold), numbers)
 
 
 def grouped(
@@ -93,14 +93,14 @@ def grouped(
     note: str = "",
     strong: Callable[[Sequence[str]], bool] = _never,
     texts: int = 1,
-) -> Table:
+) -> ReportTable:
     """Return a table of rows under headings, with the `strong` rows in bold; the first `texts` columns are text."""
     rows: list[Sequence[str]] = []
     for heading, group in groups.items():
         rows.append((heading,))
         rows += group
     bold = frozenset(k for k, row in enumerate(rows) if strong(row))
-    return Table(title, header, rows, note, bold, range(texts, len(header)))
+    return ReportTable(title, header, rows, note, bold, range(texts, len(header)))
 
 
 def shortened(text: str, max_letters: int) -> str:
@@ -151,7 +151,7 @@ def pictures(title: str, figures: Mapping[str, Picture], names: Iterable[str]) -
     return Pictures(title, [figures[name] for name in names if name in figures])
 
 
-Block = Table | Text | Pictures
+Block = ReportTable | Text | Pictures
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ def rendered(blocks: Iterable[Block]) -> Iterator[RenderableType]:
     for block in blocks:
         if not len(block):
             continue
-        if isinstance(block, Table):
+        if isinstance(block, ReportTable):
             yield _rich_table(block)
         elif isinstance(block, Text):
             for line in block.lines:
@@ -227,7 +227,7 @@ def single_colons(line: str) -> str:
     return line.replace(":: ", ": ")
 
 
-def _rich_table(table: Table) -> RichTable:
+def _rich_table(table: ReportTable) -> RichTable:
     """Return a table as a rich renderable."""
     title = table.title[:1].lower() + table.title[1:]
     caption = RichText(table.note) if table.note else None

@@ -7,7 +7,7 @@ import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import matplotlib
 import numpy as np
@@ -16,10 +16,14 @@ from matplotlib.axis import XAxis, YAxis
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import LogLocator, NullLocator
 from PIL import Image
 
 from calib import files
+
+if TYPE_CHECKING:
+    from matplotlib.typing import RcKeyType
 
 BEFORE, AFTER, MARK, QUIET, INK = "#e2a26b", "#17486e", "#b3261e", "#8a8f98", "#22262b"
 # BEFORE, dark enough for letters
@@ -32,7 +36,7 @@ DPI = 200
 COLOURS = 256
 # stretches of a curve, of which each keeps its smallest and its largest value
 STRETCHES = 700
-STYLE: Any = {
+STYLE: "dict[RcKeyType, str | float | bool]" = {
     "font.family": "DejaVu Sans",
     "font.size": 7.5,
     "axes.titlesize": 8.5,
@@ -89,9 +93,9 @@ def sheet(
         width, height: of the figure [in].
         head: what is kept free at the top for `legend` [in].
     """
-    figure = ShownFigure(figsize=(width, height), layout="constrained")
-    engine: Any = figure.get_layout_engine()
-    engine.set(rect=(0.0, 0.0, 1.0, 1.0 - head / height), w_pad=0.04, h_pad=0.04, wspace=0.0, hspace=0.0)
+    drawn_part = (0.0, 0.0, 1.0, 1.0 - head / height)
+    layout = ConstrainedLayoutEngine(rect=drawn_part, w_pad=0.04, h_pad=0.04, wspace=0.0, hspace=0.0)
+    figure = ShownFigure(figsize=(width, height), layout=layout)
     return figure, list(figure.subplots(rows, columns, squeeze=False).flat)
 
 

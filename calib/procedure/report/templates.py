@@ -7,7 +7,7 @@ import platform
 from datetime import datetime
 from functools import cache
 from importlib import metadata, resources
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import jinja2
@@ -34,7 +34,7 @@ def read(package: str, file: str) -> str:
     return resources.files(package).joinpath(file).read_text(encoding="utf-8")
 
 
-def filled(package: str, file: str, **values: Any) -> str:
+def filled(package: str, file: str, **values: object) -> str:
     """Return a package's template, filled with values; it may import ``blocks.html`` and print the common `style`."""
     return _template(package, file).render(**values, style=read(HERE, "style.css"))
 

@@ -15,7 +15,7 @@ from calib.procedure.kinematic_stage.folder import SCHEMA, URDF
 from calib.procedure.kinematic_stage.metrics import FitMetrics
 from calib.procedure.report import fit_report
 from calib.procedure.report.certificate import dynamics, geometry, rendering
-from calib.procedure.report.certificate.record import EDITED, Certificate, Entry, Page, Stage, records
+from calib.procedure.report.certificate.record import EDITED, Certificate, Entry, Page, StageRecord, records
 from calib.procedure.report.certificate.results import measured_range, tolerance
 from calib.procedure.report.fit_report import RowErrors, file_row, unseen_role
 from calib.procedure.report.page import FileRow, Text
@@ -32,7 +32,7 @@ from calib.procedure.session.folder import (
     read_state,
 )
 from calib.procedure.session.geometry_steps import chain_of
-from calib.procedure.session.steps import ExportedFile, SessionFile, SessionStep, Setting
+from calib.procedure.session.steps import ExportedFile, SessionFile, SessionStep, StepSetting
 from calib.records import read_json, read_lines
 
 RECORDINGS: Point[Callable[[Path], str]] = Point(
@@ -91,7 +91,7 @@ def pages(session: Session) -> tuple[Certificate, Page]:
     return records(title, subtitle, setup, stages, unchecked, listed(session), settings.certificate, alert)
 
 
-def _geometry(session: Session, report: fit_report.Report) -> Stage:
+def _geometry(session: Session, report: fit_report.Report) -> StageRecord:
     """Return the stage of the geometry, with figures if the session draws any."""
     figures = {}
     if session.plots:
@@ -102,7 +102,7 @@ def _geometry(session: Session, report: fit_report.Report) -> Stage:
     return _with_arrival(geometry.stage(report, figures), _arrival_notes(session, "3-measured", "validate"))
 
 
-def _dynamics(session: Session) -> Stage:
+def _dynamics(session: Session) -> StageRecord:
     """Return the stage of the dynamics, with figures if the session draws any, judged on the exported robot."""
     from calib.procedure.report import dynamics_section
 
@@ -166,13 +166,13 @@ def _arrival_notes(session: Session, folder: str, step: str) -> list[str]:
     return [line for line in lines if line.strip()]
 
 
-def _with_arrival(stage: Stage, lines: list[str]) -> Stage:
+def _with_arrival(stage: StageRecord, lines: list[str]) -> StageRecord:
     """Return a stage whose section of the report has the missing notes on its input files, too."""
     blocks = stage.section.blocks
     present: set[str] = set()
     for block in blocks:
         if isinstance(block, Text):
-            present.update(block.lines)
+            present.update(map(str, block.lines))
     missing = [line for line in dict.fromkeys(lines) if line not in present]
     notes = Text("Notes on the files when they were read", missing)
     return replace(stage, section=replace(stage.section, blocks=[*blocks, notes]))
@@ -345,12 +345,12 @@ STEP = SessionStep(
     ),
     makes=PAGES,
     settings=(
-        Setting("name"),
-        Setting("created"),
-        Setting("instrument"),
-        Setting("poses"),
-        Setting("fit"),
-        Setting("dynamics", ("torques", "payloads", "tolerance_percent")),
-        Setting("certificate"),
+        StepSetting("name"),
+        StepSetting("created"),
+        StepSetting("instrument"),
+        StepSetting("poses"),
+        StepSetting("fit"),
+        StepSetting("dynamics", ("torques", "payloads", "tolerance_percent")),
+        StepSetting("certificate"),
     ),
 )

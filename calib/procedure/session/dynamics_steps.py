@@ -29,7 +29,7 @@ from calib.identification.identify_options import FileSettings, IdentifyOptions,
 from calib.identification.settings import Payload
 from calib.procedure.dynamic_stage import identify as identifying
 from calib.procedure.dynamic_stage import inputs
-from calib.procedure.dynamic_stage.identify import Assessment, assess
+from calib.procedure.dynamic_stage.identify import DynamicsAssessment, assess
 from calib.procedure.excitation import coefficients, prediction
 from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.excitation.settings import ExcitationSettings
@@ -411,7 +411,7 @@ def predict(session: Session, say: Say) -> list[str | Note]:
     return [*notes, str(assessment.verdict), *as_notes(new_warnings, assessment.noticed)]
 
 
-def _as_delivered(session: Session, assessment: Assessment) -> Verdict:
+def _as_delivered(session: Session, assessment: DynamicsAssessment) -> Verdict:
     """Return the verdict on the exported robot; a model that cannot be exported gets the verdict prediction only."""
     from calib.procedure.export.delivery import Export
 

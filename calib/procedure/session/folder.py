@@ -34,7 +34,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from calib import files
 from calib.config import parse
@@ -47,7 +46,7 @@ from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.findings import Verdict, Verdicts
 from calib.procedure.kinematic_stage.folder import IN_SESSION, URDF, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.session.settings import NOTHING, SCHEMA, SessionSettings, check_schema, read_settings, written
-from calib.records import plain
+from calib.records import FieldValues, plain
 from calib.result_kinds import refusal
 from calib.robot import tables
 from calib.robot.calibrated import ROBOT
@@ -136,9 +135,9 @@ class Session:
         return self.path(name) if name else None
 
     @property
-    def links(self) -> dict[str, Any]:
+    def links(self) -> FieldValues:
         """The arm's first and last link: as given to `calib new`, else as its fit has them; None: to be chosen."""
-        links: dict[str, Any] = {"base": self.settings.robot.base or None, "tip": self.settings.robot.tip or None}
+        links: FieldValues = {"base": self.settings.robot.base or None, "tip": self.settings.robot.tip or None}
         fitted = self.fit.path / ROBOT
         if links["tip"] is None and is_urdf(self.robot_file) and fitted.is_file():
             links["tip"] = tables.load(fitted).get("tip")

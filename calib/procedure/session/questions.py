@@ -4,7 +4,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,6 +17,7 @@ from calib.errors import CalibError, UsageError, one_of, refused_as, require
 from calib.procedure.answers import CAMERA, CELL, Answers, CertificateSection
 from calib.procedure.measuring.constraints_file import AXES, ConstraintsFile
 from calib.procedure.session.settings import NOTHING, InstrumentSection
+from calib.records import FieldValues
 from calib.robot.library import resolve
 from calib.transforms import pose, to_xyz_rpy
 
@@ -163,7 +163,7 @@ def with_answer(answers: Answers, question: Question, text: str) -> Answers:
     return result
 
 
-def checked(answers: Answers) -> dict[str, Any]:
+def checked(answers: Answers) -> FieldValues:
     """Return the arguments of `calib.procedure.session.commands.new_session` from checked answers.
 
     Raises:

@@ -26,7 +26,14 @@ from calib.procedure.excitation.settings import ExcitationSettings
 from calib.procedure.findings import limit
 from calib.procedure.session.dynamics_steps import next_round, options_of
 from calib.procedure.session.folder import ROUND, Say, Session, read_state
-from calib.procedure.session.steps import FITTED_ROBOT, IDENTIFY_OPTIONS, NamedFile, SessionFile, SessionStep, Setting
+from calib.procedure.session.steps import (
+    FITTED_ROBOT,
+    IDENTIFY_OPTIONS,
+    NamedFile,
+    SessionFile,
+    SessionStep,
+    StepSetting,
+)
 from calib.robot.library import load_calibrated
 
 # [%] of torques and σ, where none is stated
@@ -41,7 +48,7 @@ class _Parameter(NamedTuple):
     essential: float | None
 
 
-class _Short(NamedTuple):
+class _ShortParameter(NamedTuple):
     """A joint whose torque is worse than asked for: index, error on unseen motion [%], torque rms [N m or N]."""
 
     joint: int
@@ -85,8 +92,8 @@ def extend(session: Session, say: Say) -> list[str]:
         inputs = read_inputs(session.fit.path, settings, limits=limits, after=identification.path)
         task = prediction.task_of(inputs, settings.seed)
         before = prediction.known_sigmas(inputs, task)[0][0]
-        helped: list[_Short] = []
-        unmodelled: list[_Short] = []
+        helped: list[_ShortParameter] = []
+        unmodelled: list[_ShortParameter] = []
         for joint in short:
             # The error that would remain if the parameters were known exactly.
             remaining = joint.left(before, 0.0 * before)
@@ -108,7 +115,7 @@ def extend(session: Session, say: Say) -> list[str]:
     return [*_gains(designed, helped, aimed), *notes]
 
 
-def _short_joints(session: Session, tolerance: float) -> list[_Short]:
+def _short_joints(session: Session, tolerance: float) -> list[_ShortParameter]:
     """Return the joints whose motor torque is worse than tolerated [%], where the torques together are."""
     report = session.identification.unseen.read()
     recordings = (report.proofs or report.fit).values()
@@ -123,7 +130,7 @@ def _short_joints(session: Session, tolerance: float) -> list[_Short]:
     short = []
     for joint, (error, size) in enumerate(zip(errors.tolist(), sizes)):
         if error > tolerance:
-            short.append(_Short(joint, error, size))
+            short.append(_ShortParameter(joint, error, size))
     return short
 
 
@@ -139,7 +146,7 @@ def _weak_parameters(session: Session, tolerance: float) -> tuple[str, ...]:
     return tuple(weak)
 
 
-def _unmodelled(inputs: ExcitationInputs, joints: list[_Short]) -> list[str]:
+def _unmodelled(inputs: ExcitationInputs, joints: list[_ShortParameter]) -> list[str]:
     """Return a note on the joints that more motion does not help."""
     if not joints:
         return []
@@ -147,7 +154,7 @@ def _unmodelled(inputs: ExcitationInputs, joints: list[_Short]) -> list[str]:
     return [f"more motion does not help {names}: what is left is not modelled (friction, elasticity)"]
 
 
-def _gains(designed: design.Designed, joints: list[_Short], parameters: tuple[str, ...]) -> list[str]:
+def _gains(designed: design.Designed, joints: list[_ShortParameter], parameters: tuple[str, ...]) -> list[str]:
     """Return a note on what a motion will bring to joints and parameters, the worst first."""
     outlook = designed.outlook
     names = designed.inputs.chain.joint_names
@@ -220,11 +227,11 @@ STEP = SessionStep(
     ),
     makes=(f"6-excitation/{ROUND}*/*",),
     settings=(
-        Setting(
+        StepSetting(
             "dynamics",
             ("tolerance_percent", "sigma_percent", "period", "harmonics", "rate", "starts", "evaluations", "repeats"),
         ),
-        Setting("seed"),
+        StepSetting("seed"),
     ),
     stage="need",
 )

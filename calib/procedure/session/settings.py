@@ -307,7 +307,7 @@ def written(settings: SessionSettings) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _lines(section: "DataclassInstance", prefix: str = "") -> Iterator[str]:
+def _lines(section: "DataclassInstance | type[DataclassInstance]", prefix: str = "") -> Iterator[str]:
     """Yield the lines of a section, with the comments of keys aligned in one column, and tables last."""
     comments = described(type(section))
     tables = []

@@ -117,7 +117,7 @@ Input = SessionFile | FitFile | ExportedFile | NamedFile | UserFiles
 
 
 @dataclass(frozen=True)
-class Setting:
+class StepSetting:
     """A section or value of ``session.toml`` on which a step depends: all of it, or these keys of it."""
 
     section: str
@@ -144,7 +144,7 @@ class SessionStep:
     make: Callable[[Session, Say], Sequence[str | Note]]
     reads: tuple[Input, ...]
     makes: tuple[str, ...]
-    settings: tuple[Setting, ...]
+    settings: tuple[StepSetting, ...]
     stage: str = ""
     brings: tuple[str, str] = ("", "")
     kept: tuple[tuple[str, ...], str] = ((), "")
@@ -185,7 +185,7 @@ STEPS = (
         geometry_steps.describe,
         reads=(ROBOT,),
         makes=(folder.SUMMARY, f"{folder.AS_GIVEN}/*"),
-        settings=(Setting("robot"),),
+        settings=(StepSetting("robot"),),
     ),
     SessionStep(
         "select",
@@ -200,7 +200,7 @@ STEPS = (
             folder.PREDICTED,
             folder.PREDICTION,
         ),
-        settings=(Setting("robot"), Setting("instrument"), Setting("poses"), Setting("seed")),
+        settings=(StepSetting("robot"), StepSetting("instrument"), StepSetting("poses"), StepSetting("seed")),
         stage="geometry",
         kept=(("measured",), "these poses were already measured; `calib redo select` chooses new ones"),
     ),
@@ -216,7 +216,7 @@ STEPS = (
             UserFiles("drift"),
         ),
         makes=(folder.POSES_CHECKED,),
-        settings=(Setting("robot"), Setting("instrument"), Setting("poses"), Setting("fit")),
+        settings=(StepSetting("robot"), StepSetting("instrument"), StepSetting("poses"), StepSetting("fit")),
         stage="geometry",
         brings=("measured", "a file of measured poses"),
     ),
@@ -226,7 +226,7 @@ STEPS = (
         geometry_steps.fit,
         reads=(ROBOT, FIT_OPTIONS, UserFiles("measured"), SessionFile(f"{folder.MASSES}/{MODEL}", optional=True)),
         makes=("4-fit/*",),
-        settings=(Setting("robot"), Setting("instrument"), Setting("fit"), Setting("seed")),
+        settings=(StepSetting("robot"), StepSetting("instrument"), StepSetting("fit"), StepSetting("seed")),
         stage="geometry",
     ),
     SessionStep(
@@ -241,7 +241,13 @@ STEPS = (
             UserFiles("validation"),
         ),
         makes=("5-validation/*",),
-        settings=(Setting("robot"), Setting("instrument"), Setting("poses"), Setting("fit"), Setting("seed")),
+        settings=(
+            StepSetting("robot"),
+            StepSetting("instrument"),
+            StepSetting("poses"),
+            StepSetting("fit"),
+            StepSetting("seed"),
+        ),
         stage="geometry",
         brings=("validation", "a file of measured validation poses"),
     ),
@@ -251,7 +257,7 @@ STEPS = (
         dynamics_steps.excite,
         reads=(FITTED_ROBOT, NamedFile("dynamics", "limits")),
         makes=("6-excitation/training/*", "6-excitation/validation/*"),
-        settings=(Setting("dynamics", DESIGN_KEYS), Setting("seed")),
+        settings=(StepSetting("dynamics", DESIGN_KEYS), StepSetting("seed")),
         stage="dynamics",
         kept=(("training", "unseen"), "these motions were already recorded; `calib redo excite` designs new ones"),
     ),
@@ -266,7 +272,7 @@ STEPS = (
             UserFiles("training"),
         ),
         makes=(folder.MOTION_CHECKED, folder.CUTS),
-        settings=(Setting("dynamics", ("plan", "repeats", "torques", "options", "payloads", "holdout")),),
+        settings=(StepSetting("dynamics", ("plan", "repeats", "torques", "options", "payloads", "holdout")),),
         stage="dynamics",
         brings=("training", "a recording of the training motion"),
     ),
@@ -276,7 +282,7 @@ STEPS = (
         dynamics_steps.identify,
         reads=(FITTED_ROBOT, SessionFile(folder.CUTS), IDENTIFY_OPTIONS, UserFiles("training")),
         makes=("8-dynamics/*",),
-        settings=(Setting("dynamics", MODEL_KEYS), Setting("seed")),
+        settings=(StepSetting("dynamics", MODEL_KEYS), StepSetting("seed")),
         stage="dynamics",
     ),
     SessionStep(
@@ -295,8 +301,8 @@ STEPS = (
         ),
         makes=("8-dynamics/unseen/*",),
         settings=(
-            Setting("dynamics", ("plan", "validation", "repeats", "tolerance_percent", *MODEL_KEYS)),
-            Setting("seed"),
+            StepSetting("dynamics", ("plan", "validation", "repeats", "tolerance_percent", *MODEL_KEYS)),
+            StepSetting("seed"),
         ),
         stage="dynamics",
         brings=("unseen", "a recording of the validation motion"),
@@ -316,7 +322,7 @@ STEPS = (
             SessionFile(f"8-dynamics/unseen/{REPORT}"),
         ),
         makes=("6-export/*", "9-export/*", folder.VERDICT),
-        settings=(Setting("robot"),),
+        settings=(StepSetting("robot"),),
     ),
 )
 

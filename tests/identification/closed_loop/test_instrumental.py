@@ -11,7 +11,7 @@ from calib.dynamics import base as bases
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of
 from calib.dynamics.idim import IdentificationModel
-from calib.dynamics.shapes import JointRange
+from calib.dynamics.shapes import RecordedRange
 from calib.errors import MeasurementError, NotConverged, Unidentifiable, UsageError
 from calib.identification.closed_loop import controllers, instrumental, instrumental_variables
 from calib.identification.closed_loop.controllers import identify_controller
@@ -253,7 +253,7 @@ def test_instruments_that_do_not_excite_a_parameter_are_named():
 def test_instruments_know_all_friction_that_the_simulator_knows(step, value):
     """Measured: within 0.7 of a sigma for every parameter, where least squares is 15 of its sigmas off."""
     plant, model, base = arm()
-    terms = [one for j in range(2) for one in drives.offered(step, j, JointRange(0.5, 4.0, 4.0, 3.6))]
+    terms = [one for j in range(2) for one in drives.offered(step, j, RecordedRange(0.5, 4.0, 4.0, 3.6))]
     truth_of = np.append(base.transform @ plant.parameters, np.full(len(terms), value))
     rich = Plant(plant.bodies, (*plant.terms, *terms), np.append(plant.parameters, np.full(len(terms), value)))
     case = log(2e-3, 0, plant=rich)

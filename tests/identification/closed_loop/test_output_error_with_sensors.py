@@ -84,10 +84,10 @@ def test_friction_is_what_the_method_takes():
 
 def test_friction_without_derivatives_is_refused_by_name():
     from calib.dynamics import drives
-    from calib.dynamics.shapes import JointRange
+    from calib.dynamics.shapes import RecordedRange
 
     problem, _ = sensed(BOTH, 0, 0.0)
-    terms = drives.offered("presliding", 0, JointRange(0.2, 2.0, 3.0, 3.0))
+    terms = drives.offered("presliding", 0, RecordedRange(0.2, 2.0, 3.0, 3.0))
     rows = tuple(one.extend(terms, np.ones((*one.target.shape, len(terms)))) for one in problem.rows)
     found = replace(problem, rows=rows, terms=(*problem.terms, *terms))
     with pytest.raises(Exception, match=r"no derivatives .* iv and didim take it"):

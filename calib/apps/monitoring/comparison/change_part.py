@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.apps.monitoring.comparison.change_test import ChangeTest, ParameterChange
 from calib.errors import Finding, finding
-from calib.toolkit.report_pages import Block, Column, KeyFigure, Section, Text, met, table
+from calib.toolkit.report_pages import Block, KeyFigure, RecordColumn, Section, Text, met, table
 from calib.toolkit.result_folders import Verdict, notes_of, settle
 from calib.units import SMALL
 
@@ -71,7 +71,7 @@ class ChangePart(ABC):
         """Return an error as text with its unit."""
 
     @abstractmethod
-    def numbers(self) -> dict[str, Any]:
+    def numbers(self) -> dict[str, object]:
         """Return the numbers that this kind alone has [SI]."""
 
     @cached_property
@@ -129,7 +129,7 @@ class ChangePart(ABC):
     def basis(self) -> str:
         """On what `today` rests."""
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the numbers as in ``metrics.json`` [SI]."""
         change_test: ChangeTest = self.change
         return {
@@ -183,11 +183,11 @@ def _change_alone(parameter: ParameterChange) -> str:
 
 
 _PARAMETERS = [
-    Column("parameter", "{0.name}", number=False),
-    Column("before", _before),
-    Column("after", _after),
-    Column("change", _change),
-    Column("σ", _sigmas),
-    Column("if it changed alone", _change_alone),
-    Column("χ² explained", "{0.explained:.3g}"),
+    RecordColumn("parameter", "{0.name}", number=False),
+    RecordColumn("before", _before),
+    RecordColumn("after", _after),
+    RecordColumn("change", _change),
+    RecordColumn("σ", _sigmas),
+    RecordColumn("if it changed alone", _change_alone),
+    RecordColumn("χ² explained", "{0.explained:.3g}"),
 ]

@@ -23,7 +23,7 @@ from calib.errors import Finding, UsageError, require
 from calib.records import plain
 from calib.result_kinds import BY_NAME
 from calib.toolkit.report_pages import Block, KeyFigure, Section
-from calib.toolkit.result_folders import LEVELS, Drawn, DynamicsModel, GeometryFit, Judged, Verdict, saved
+from calib.toolkit.result_folders import LEVELS, ChartedResult, DynamicsModel, GeometryFit, Judged, Verdict, saved
 
 if TYPE_CHECKING:
     from calib.toolkit.report_charts import Chart
@@ -32,7 +32,7 @@ TABLES = (ToolPart.table, TorquePart.table)
 
 
 @dataclass(frozen=True, eq=False)
-class RobotChange(Drawn, Judged):
+class RobotChange(ChartedResult, Judged):
     """What changed between two calibrations of a robot. ``print`` shows the verdict, what moved, the parameters.
 
     Attributes:
@@ -113,7 +113,7 @@ class RobotChange(Drawn, Judged):
         part = self.parts[0]
         return part.before.name, part.after.name, part.before.robot.chain.name
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the numbers as in ``metrics.json`` [SI]."""
         before, after, _ = self._names
         numbers: dict[str, Any] = {

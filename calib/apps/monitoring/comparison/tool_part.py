@@ -13,7 +13,7 @@ from calib.apps.monitoring.comparison.change_part import ChangePart
 from calib.apps.monitoring.comparison.geometry_change import ToolMotion
 from calib.apps.monitoring.settings import DEFAULT_DIFF, DiffSettings
 from calib.errors import Finding, finding
-from calib.toolkit.report_pages import Block, Column, FittedParameter, Text, table
+from calib.toolkit.report_pages import Block, FittedParameter, RecordColumn, Text, table
 from calib.units import JOINT
 
 if TYPE_CHECKING:
@@ -99,17 +99,20 @@ class ToolPart(ChangePart):
 
     def blocks(self) -> list[Block]:
         motions = [
-            Column("target's motion at", "{0.where}", number=False),
-            Column("poses", lambda motion: f"{len(motion.q)}"),
-            Column("median mm", _median_mm),
-            Column("rms mm", lambda motion: f"{1e3 * motion.rms:.3g}"),
-            Column("σ of that mm", lambda motion: f"{1e3 * motion.expected:.2g}"),
-            Column("worst mm", _worst_mm),
-            Column("median mrad", _median_mrad),
-            Column("worst mrad", _worst_mrad),
-            Column("worst at", self._worst_joints, number=False),
+            RecordColumn("target's motion at", "{0.where}", number=False),
+            RecordColumn("poses", lambda motion: f"{len(motion.q)}"),
+            RecordColumn("median mm", _median_mm),
+            RecordColumn("rms mm", lambda motion: f"{1e3 * motion.rms:.3g}"),
+            RecordColumn("σ of that mm", lambda motion: f"{1e3 * motion.expected:.2g}"),
+            RecordColumn("worst mm", _worst_mm),
+            RecordColumn("median mrad", _median_mrad),
+            RecordColumn("worst mrad", _worst_mrad),
+            RecordColumn("worst at", self._worst_joints, number=False),
         ]
-        by_joint = [Column("joint", "{0[0]}", number=False), Column("rms mm", lambda row: f"{1e3 * row[1]:.3g}")]
+        by_joint = [
+            RecordColumn("joint", "{0[0]}", number=False),
+            RecordColumn("rms mm", lambda row: f"{1e3 * row[1]:.3g}"),
+        ]
         return [
             Text("Motion", self._motion()),
             table("Motion of the tool", motions, self.change.motions),

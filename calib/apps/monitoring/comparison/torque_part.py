@@ -11,7 +11,7 @@ import numpy as np
 from calib.apps.monitoring.comparison.change_part import ChangePart
 from calib.apps.monitoring.comparison.torque_change import TorqueChange
 from calib.errors import Finding, finding
-from calib.toolkit.report_pages import Block, Column, Text, table
+from calib.toolkit.report_pages import Block, RecordColumn, Text, table
 
 if TYPE_CHECKING:
     from calib.toolkit.report_charts import Chart
@@ -118,18 +118,18 @@ class TorquePart(ChangePart):
                     )
                 )
         torques = [
-            Column("motion", "{0.motion}", number=False),
-            Column("torque of", "{0.name}", number=False),
-            Column(f"change rms {unit}", "{0.change:.3g}"),
-            Column("σ of that", "{0.expected:.2g}"),
-            Column("worst", "{0.worst:.3g}"),
-            Column("torque rms", "{0.torque:.3g}"),
+            RecordColumn("motion", "{0.motion}", number=False),
+            RecordColumn("torque of", "{0.name}", number=False),
+            RecordColumn(f"change rms {unit}", "{0.change:.3g}"),
+            RecordColumn("σ of that", "{0.expected:.2g}"),
+            RecordColumn("worst", "{0.worst:.3g}"),
+            RecordColumn("torque rms", "{0.torque:.3g}"),
         ]
         parts = [
-            Column("part", "{0.name}", number=False),
-            Column("χ² explained", "{0.explained:.3g}"),
-            Column("of combinations", "{0.count}"),
-            Column(f"torque if it changed alone, rms {unit}", "{0.rms:.3g}"),
+            RecordColumn("part", "{0.name}", number=False),
+            RecordColumn("χ² explained", "{0.explained:.3g}"),
+            RecordColumn("of combinations", "{0.count}"),
+            RecordColumn(f"torque if it changed alone, rms {unit}", "{0.rms:.3g}"),
         ]
         return [
             Text("Torque", [self._words(change) for change in self.change.torques]),

@@ -12,9 +12,9 @@ import numpy as np
 from calib.folders import METRICS
 from calib.procedure.excitation import coefficients
 from calib.procedure.findings import sentence
-from calib.procedure.report.certificate.record import Stage
+from calib.procedure.report.certificate.record import StageRecord
 from calib.procedure.report.dynamics_section import DynamicReport, percent, proof_of, rms_words, warnings_of
-from calib.procedure.report.page import Picture, Pictures, Section, Table, Text
+from calib.procedure.report.page import Picture, Pictures, ReportTable, Section, Text
 from calib.records import read_json
 from calib.robot.chain import Joint
 
@@ -34,7 +34,7 @@ NOTE = (
 )
 
 
-def stage(report: DynamicReport, section: Section, plots: bool, tolerance: float = 0.0) -> Stage:
+def stage(report: DynamicReport, section: Section, plots: bool, tolerance: float = 0.0) -> StageRecord:
     """Return the stage of an identification.
 
     Args:
@@ -53,7 +53,7 @@ def stage(report: DynamicReport, section: Section, plots: bool, tolerance: float
     # what stands under uncertainty is not repeated among the findings
     uncertainty = tuple(_uncertainty_findings(report))
     findings = [line for line in warnings_of(report) if not line.startswith(uncertainty)]
-    return Stage(section, blocks, list(_unchecked(report, tolerance)), findings)
+    return StageRecord(section, blocks, list(_unchecked(report, tolerance)), findings)
 
 
 def _unchecked(report: DynamicReport, tolerance: float) -> Iterator[str]:
@@ -78,7 +78,7 @@ def _worst_first(report: DynamicReport) -> np.ndarray:
     return np.argsort(-errors, kind="stable")
 
 
-def _torque_table(report: DynamicReport, order: np.ndarray) -> Table:
+def _torque_table(report: DynamicReport, order: np.ndarray) -> ReportTable:
     unseen = report.unseen
     name, proof, motion = proof_of(unseen)
     interval = proof.interval95
@@ -97,7 +97,7 @@ def _torque_table(report: DynamicReport, order: np.ndarray) -> Table:
     if len(order) > MAX_ROWS:
         note += f" The {MAX_ROWS} largest of {len(order)}; all: see report.html."
     header = ("torque", "rms error", "of limit", "unexplained", "in band", "95 % interval", "within it")
-    return Table(f"Torque errors on {motion} ({name})", header, rows, note, frozenset({0}), range(1, 7))
+    return ReportTable(f"Torque errors on {motion} ({name})", header, rows, note, frozenset({0}), range(1, 7))
 
 
 def _curves(report: DynamicReport, order: np.ndarray) -> Iterator[Picture]:

@@ -8,7 +8,7 @@ import numpy as np
 from calib.procedure.findings import sentence
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics
 from calib.procedure.kinematic_stage.validation import ARM
-from calib.procedure.report.certificate.record import Stage
+from calib.procedure.report.certificate.record import StageRecord
 from calib.procedure.report.fit_report import Report, RowErrors
 from calib.procedure.report.geometry_section import (
     deciding,
@@ -31,7 +31,7 @@ NO_ISO = (
 )
 
 
-def stage(report: Report, drawn: Mapping[str, Picture]) -> Stage:
+def stage(report: Report, drawn: Mapping[str, Picture]) -> StageRecord:
     """Return the stage of a fit.
 
     Args:
@@ -41,7 +41,7 @@ def stage(report: Report, drawn: Mapping[str, Picture]) -> Stage:
     # what stands under uncertainty is not repeated among the findings
     uncertainty = tuple(_uncertainty_findings(report.metrics))
     findings = [line for line in report.metrics.warnings if not line.startswith(uncertainty)]
-    return Stage(report_section(report, drawn), blocks, list(_unchecked(report)), findings)
+    return StageRecord(report_section(report, drawn), blocks, list(_unchecked(report)), findings)
 
 
 def _blocks(report: Report, plots: bool) -> Iterator[Block]:

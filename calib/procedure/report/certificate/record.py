@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 
 from calib.config import described
 from calib.procedure.answers import CertificateSection
-from calib.procedure.report.page import Block, FileRow, KeyFigure, Section, Table, Text, shortened
+from calib.procedure.report.page import Block, FileRow, KeyFigure, ReportTable, Section, Text, shortened
 from calib.procedure.report.templates import issued
 
 MAX_PAGES = 4
@@ -112,14 +112,14 @@ class Certificate(Page):
     number: Entry
     alert: str
     verdicts: Sequence[Judgement]
-    tolerances: Table
+    tolerances: ReportTable
     setup: Sequence[Entry]
     details: Sequence[Entry]
     signatures: Sequence[str]
 
 
 @dataclass(frozen=True)
-class Stage:
+class StageRecord:
     """A stage of a calibration, as report and certificate show it.
 
     Attributes:
@@ -139,7 +139,7 @@ def records(
     title: str,
     subtitle: str,
     setup: Sequence[Entry],
-    stages: Sequence[Stage],
+    stages: Sequence[StageRecord],
     unchecked: Sequence[str] = (),
     files: Sequence[FileRow] = (),
     details: CertificateSection = NO_DETAILS,
@@ -211,7 +211,7 @@ def judgement(section: Section, max_letters: int | None = None) -> Judgement:
     return Judgement(section.title, level, label, reason)
 
 
-def key_table(sections: Sequence[Section]) -> Table:
+def key_table(sections: Sequence[Section]) -> ReportTable:
     """Return the table of what verdicts rest on: before, after, tolerance asked, and whether it is met."""
     header = ("quantity", "nominal", "after", "standard error", "on", "tolerance asked", "met")
     rows, with_tolerance = [], set()
@@ -222,7 +222,7 @@ def key_table(sections: Sequence[Section]) -> Table:
             if figure.allowed and figure.allowed != "–":
                 with_tolerance.add(len(rows))
             rows.append(_cells(figure))
-    return Table("Tolerance asked and met", header, rows, strong=frozenset(with_tolerance), numbers=(1, 2, 3, 5))
+    return ReportTable("Tolerance asked and met", header, rows, strong=frozenset(with_tolerance), numbers=(1, 2, 3, 5))
 
 
 def _cells(figure: KeyFigure) -> tuple[str, ...]:
@@ -232,7 +232,7 @@ def _cells(figure: KeyFigure) -> tuple[str, ...]:
 
 def _cut(block: Text) -> Text:
     """Return a text of a certificate with at most `MAX_LINES` sentences of `MAX_LINE` letters; the report has all."""
-    lines = [shortened(_local(line), MAX_LINE) for line in block.lines]
+    lines = [shortened(_local(str(line)), MAX_LINE) for line in block.lines]
     if len(lines) > MAX_LINES:
         count = len(lines) - MAX_LINES + 1
         lines = [*lines[: MAX_LINES - 1], f"{count} more: see {REPORT}."]
@@ -244,10 +244,10 @@ def _local(text: str) -> str:
     return re.sub(r"(?<![\w.~/])/(?:[^/\s]+/)+(?=[^/\s])", "", text)
 
 
-def files_table(files: Sequence[FileRow], max_files: int | None = None) -> Table:
+def files_table(files: Sequence[FileRow], max_files: int | None = None) -> ReportTable:
     """Return the table of files with their SHA-256; of at most `max_files`, edited ones first, with short digests."""
     if max_files is None:
-        return Table("", ("file", "what it is", "bytes", "SHA-256"), files, numbers=(2,))
+        return ReportTable("", ("file", "what it is", "bytes", "SHA-256"), files, numbers=(2,))
     # what was edited by hand is not hidden among the others
     edited_first = sorted(files, key=lambda row: row[1] != EDITED)
     rows = []
@@ -256,7 +256,7 @@ def files_table(files: Sequence[FileRow], max_files: int | None = None) -> Table
     note = ""
     if len(files) > max_files:
         note = f"{len(files) - max_files} more, and whole digests: see {REPORT}."
-    return Table("Files", ("file", "what it is", "SHA-256"), rows, note)
+    return ReportTable("Files", ("file", "what it is", "SHA-256"), rows, note)
 
 
 def report(
@@ -268,7 +268,7 @@ def report(
     report_sections = [Section("Result", [Text("Verdict", reasons), key_table(sections)]), *sections]
     if setup:
         rows = [(entry.label, entry.value) for entry in setup]
-        report_sections.append(Section("Setup", [Table("", ("what", "value"), rows)]))
+        report_sections.append(Section("Setup", [ReportTable("", ("what", "value"), rows)]))
     if files:
         report_sections.append(Section("Files", [files_table(files)]))
     report_sections.append(Section("Limitations and conventions", NOTES))

@@ -23,15 +23,15 @@ from calib.procedure.report.certificate.record import (  # fmt: skip
     Certificate,
     Entry,
     Judgement,
-    Stage,
+    StageRecord,
     records,
     report,
 )
-from calib.procedure.report.page import KeyFigure, Picture, Pictures, Section, Table, Text
+from calib.procedure.report.page import KeyFigure, Picture, Pictures, ReportTable, Section, Text
 
 HOSTILE = "[bold]<script>alert(1)</script> & \"quoted\" 'one'[/]"
 ROWS = [(HOSTILE,), ("nominal", "1.5"), ("calibrated", "0.25")]
-TABLE = Table("Errors", ("arm", "rms"), ROWS, "how to read", frozenset({2}), (1,))
+TABLE = ReportTable("Errors", ("arm", "rms"), ROWS, "how to read", frozenset({2}), (1,))
 
 
 class Reader(HTMLParser):
@@ -78,7 +78,7 @@ def judged(verdict: str = "pass", reason: str = "rms 0.1 mm", blocks=()) -> Sect
 
 
 def certificate_of(*sections: Section, details=NO_DETAILS, known=ROBOT, alert="", files=(), findings=()) -> Certificate:
-    stages = [Stage(one, one.blocks, (), findings) for one in sections]
+    stages = [StageRecord(one, one.blocks, (), findings) for one in sections]
     return records("Calibration of x", "Geometry", known, stages, ["obstacles"], files, details, alert)[0]
 
 
@@ -96,7 +96,7 @@ def said(value: object) -> list[str]:
         return said(value.caption)
     if isinstance(value, Judgement):
         return said([value.title, value.label, value.reason])
-    if isinstance(value, Table | Text | Pictures | Section | Certificate) or hasattr(value, "label"):
+    if isinstance(value, ReportTable | Text | Pictures | Section | Certificate) or hasattr(value, "label"):
         hidden = {"kind", "strong", "numbers", "figures", "verdict", "reason"}
         if not isinstance(value, Certificate) and hasattr(value, "kind") and not len(value):  # type: ignore[arg-type]
             return []
@@ -120,7 +120,7 @@ def test_every_text_is_escaped_for_all():
     blocks = [TABLE, Text(HOSTILE, [HOSTILE]), Pictures(HOSTILE, [Picture(SVG, HOSTILE)])]
     section = Section(HOSTILE, blocks, "fail", HOSTILE, [KeyFigure(*[HOSTILE] * 7)])
     entries, files = [Entry(HOSTILE, HOSTILE)], [(HOSTILE, HOSTILE, "1", HOSTILE)]
-    details, stages = CertificateSection(*[HOSTILE] * 12), [Stage(section, blocks, [HOSTILE], [HOSTILE])]
+    details, stages = CertificateSection(*[HOSTILE] * 12), [StageRecord(section, blocks, [HOSTILE], [HOSTILE])]
     one, whole = records(HOSTILE, HOSTILE, entries, stages, [HOSTILE], files, details, HOSTILE)
     assert "<script>" not in rendering.html(whole) + rendering.html(one)
     assert HOSTILE in printed(Text("", [HOSTILE])) and HOSTILE in printed(TABLE)
@@ -185,7 +185,7 @@ def test_any_entries_leave_at_most_four_pages(entry):
     """Everything at its bound: empty, long without a blank, emoji, Chinese, right to left."""
     details = CertificateSection(*[entry[:MAX_LETTERS].strip()] * 12)
     rows = [(f"joint{k}", *["1.234 N m"] * 6) for k in range(14)]
-    table = Table("Torque errors", tuple("abcdefg"), rows, "n" * 300, numbers=range(1, 7))
+    table = ReportTable("Torque errors", tuple("abcdefg"), rows, "n" * 300, numbers=range(1, 7))
     text, pictures = Text("Findings", ["f " * 200] * 30), Pictures("", [Picture(SVG, "c" * 200, True)] * 2)
     sections = [replace(judged(reason="r " * 400, blocks=[table, pictures, text]), title=name) for name in ("A", "B")]
     sections = [replace(one, figures=[*one.figures] * 8) for one in sections]
