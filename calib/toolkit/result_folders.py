@@ -13,7 +13,7 @@ from calib.procedure.kinematic_stage.folder import IN_SESSION, URDF, VALIDATED, 
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.procedure.kinematic_stage.inputs import read_file as read_measured_file
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics, ValidationMetrics
-from calib.procedure.kinematic_stage.settings import FitSettings, Tolerance
+from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.tables import read_covariance
 from calib.procedure.robot_kinds import joints_of, stage_of
 from calib.results.registry import drawn, open_result
@@ -45,7 +45,6 @@ __all__ = [
     "Several",
     "Shown",
     "StoredResult",
-    "Tolerance",
     "Torques",
     "Unjudged",
     "UnseenReport",

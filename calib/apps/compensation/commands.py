@@ -1,11 +1,12 @@
 """Command for joint commands that reach nominal targets: compensate."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from calib.cli.shared import Out, Seed, command, numbers, progress, say
+from calib.records import FieldValues
 
 app = typer.Typer()
 

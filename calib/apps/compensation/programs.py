@@ -177,7 +177,7 @@ def _check_postures(fitted: Fitted, program: Program, groups: Sequence[Group], s
 
 
 def _compensated_group(
-    fitted: Fitted, program: Program, group: Group, start: Sequence[float] | None, options: dict[str, Any]
+    fitted: Fitted, program: Program, group: Group, start: Sequence[float] | None, options: FieldValues
 ) -> Part:
     """Return the commands of poses with one tool and configuration."""
     controller = program.controller

@@ -6,7 +6,6 @@ program sends. For ROS these commands write a JointTrajectory themselves. The mo
 """
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -61,7 +60,7 @@ def setpoints(path: Path, controller: Controller) -> tuple[np.ndarray, list[str]
     return CubicSpline(t, q)(times), [name.removeprefix(PREFIX) for name in columns]
 
 
-def stream_values(controller: Controller, q: np.ndarray) -> dict[str, Any]:
+def stream_values(controller: Controller, q: np.ndarray) -> dict[str, object]:
     """Return what the templates of streams print of setpoints (k, n) [rad]."""
     controller_values = controller.shown(q)
     rows = formatted(controller_values, controller.decimals)

@@ -119,10 +119,10 @@ def program_files(
     check_controller(name, q.shape[1], settings.pulses)
     if settings.output is not None and not controller.outputs:
         raise UsageError(f"--output: {controller.title} raises no output; the operator presses a key")
-    values: dict[str, Any]
+    values: dict[str, object]
     if moving:
         templates = controller.stream
-        values = stream_values(controller, q)
+        values = {**stream_values(controller, q)}
     else:
         templates = controller.files
         values = {"poses": _poses(controller, q, settings)}

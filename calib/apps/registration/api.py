@@ -87,7 +87,7 @@ class Placements(GeometryFit):
             frames.append(Placed(f"{standing} '{name}' in {chain.base}", inverse, sigma))
         return tuple(frames)
 
-    def lines(self, *first: str) -> Iterator[Any]:
+    def lines(self, *first: str) -> Iterator[object]:
         """Yield what a command prints: the frames whose names begin with one of `first`, and the verdict."""
         poses = self.fit.poses
         yield str(self.verdict)

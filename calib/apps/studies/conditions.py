@@ -45,7 +45,7 @@ from fnmatch import fnmatchcase
 from importlib import resources
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from annotated_types import MinLen
 
@@ -279,7 +279,7 @@ def _check_method(path: Path, key: str, name: str) -> None:
 
 def _expanded(study: StudyFile) -> list[Condition]:
     """Return the conditions of a study: all combinations of its values, each with a name."""
-    axes: dict[str, tuple[Any, ...]] = {
+    axes: dict[str, tuple[object, ...]] = {
         "robot": study.robot,
         "motion": study.motion,
         "rate": study.rate,
@@ -308,7 +308,7 @@ def _expanded(study: StudyFile) -> list[Condition]:
     return conditions
 
 
-def _name_part(axis: str, value: Any) -> str:
+def _name_part(axis: str, value: object) -> str:
     """Return how a value appears in the name of its condition."""
     if axis == "cutoff":
         return f"{value:g}Hz" if value else "unfiltered"
