@@ -49,7 +49,7 @@ class Result(Protocol):
         """The verdict; its level is `NOT_JUDGED` for what has none, as a motion."""
         ...
 
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
         """Write the result's folder (of a list of poses its files), and return its path."""
         ...
 
@@ -140,6 +140,10 @@ class StoredResult:
 
     def check_arm(self, verb: str) -> None:
         """Refuse a robot of another kind than a serial arm, of which the verb does not take results."""
+
+    def require_session(self) -> Session:
+        """Refuse: this is no session."""
+        self.refuse("session", SessionError)
 
     def motion(self) -> Path:
         """Refuse: there is no motion to play."""

@@ -28,7 +28,6 @@ from calib.robot.formats.native import NativeModel, NativeShape
 from calib.robot.formats.simulators import configurations, driven_joints, link_frame
 from calib.robot.formats.urdf_tree import Node, is_urdf, numbers, origin, parse, text
 from calib.robot.kinematics import sweep
-from calib.robot.native import NativeModel, NativeShape
 from calib.robot.obstacles import Obstacle, Wall
 from calib.transforms import pose
 

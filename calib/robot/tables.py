@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import rtoml
@@ -16,6 +16,7 @@ import rtoml
 from calib import config, config_types
 from calib.config_types import Angle, Checked, Length, Name, Real, Text, shown
 from calib.errors import RobotError, refuse_robot
+from calib.records import FieldValues
 from calib.robot.chain import Chain
 from calib.transforms import from_xyz_rpy, to_xyz_rpy
 

@@ -5,10 +5,10 @@ from calib.api.kinematic import GeometryFit, Several, fit_geometry
 from calib.api.rendering import ChartedResult, Judged, Progress, Shown, Unjudged, saved
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.metrics import UnseenReport
-from calib.procedure.export.delivery import fit_verdicts, prediction
+from calib.procedure.export.delivery import prediction
 from calib.procedure.export.geometry import read as read_exported
 from calib.procedure.export.geometry import results as geometry_results
-from calib.procedure.findings import LEVELS, Verdict, limit, lines_of, notes_of, sentence, settle
+from calib.procedure.findings import LEVELS, Note, Verdict, as_notes, limit, lines_of, notes_of, sentence, settle
 from calib.procedure.kinematic_stage.folder import IN_SESSION, URDF, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.procedure.kinematic_stage.inputs import read_file as read_measured_file
@@ -38,6 +38,7 @@ __all__ = [
     "IdentificationFolder",
     "Judged",
     "Measured",
+    "Note",
     "Played",
     "Progress",
     "Result",
@@ -51,9 +52,9 @@ __all__ = [
     "ValidationFolder",
     "ValidationMetrics",
     "Verdict",
+    "as_notes",
     "drawn",
     "fit_geometry",
-    "fit_verdicts",
     "geometry_results",
     "joints_of",
     "limit",

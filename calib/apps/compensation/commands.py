@@ -86,7 +86,7 @@ def compensate(
     start_q = None
     if start:
         start_q = numbers(start, fitted.nominal.chain.n, "--start")
-    options: dict[str, Any] = {
+    options: FieldValues = {
         "frame": frame,
         "dof": dof,
         "tolerance": (1e-3 * position_mm, 1e-3 * turn_mrad),

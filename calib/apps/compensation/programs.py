@@ -29,6 +29,7 @@ from calib.apps.controller_programs.configurations import (
 )
 from calib.apps.controller_programs.targets import Program, pose_values
 from calib.errors import UsageError, listing
+from calib.records import FieldValues
 from calib.toolkit.installations import Goal, see
 from calib.toolkit.pose_data import Targets
 

@@ -17,7 +17,7 @@ from calib.apps.controller_programs.frames import ControllerFrame, Description, 
 from calib.apps.controller_programs.targets import number, pose_values
 from calib.toolkit.chains import CalibratedChain, Controller, nominal_of
 from calib.toolkit.installations import Installation, read_arms
-from calib.toolkit.result_folders import fit_verdicts, open_result, read_exported
+from calib.toolkit.result_folders import open_result, read_exported
 from calib.transforms import invert
 
 # of frames, by the unit of lengths
@@ -46,7 +46,8 @@ def delivery_text(
     cell, nominal = read_arms(fit)
     arm = Description.of_fit(fit, nominal.chain)
     frames = base_frame(controller, arm, world), flange_frame(controller, arm, flange)
-    lines = [f"{controller.title}: calibration of {robot.chain.name}", str(fit_verdicts(fit)), ""]
+    verdicts = open_result(fit, "deliver").verdicts
+    lines = [f"{controller.title}: calibration of {robot.chain.name}", str(verdicts), ""]
     lines += [f"It takes: {controller.takes}.", f"It does not: {controller.closed}.", ""]
     if len(nominal.tools):
         lines += [

@@ -14,7 +14,6 @@ No program was run on a real controller. Run it first at low override, beam and 
 import re
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import jinja2
 import numpy as np

@@ -87,7 +87,7 @@ class Placements(GeometryFit):
             frames.append(Placed(f"{standing} '{name}' in {chain.base}", inverse, sigma))
         return tuple(frames)
 
-    def lines(self, *first: str) -> Iterator[object]:
+    def lines(self, *first: str) -> Iterator[str]:
         """Yield what a command prints: the frames whose names begin with one of `first`, and the verdict."""
         poses = self.fit.poses
         yield str(self.verdict)
@@ -96,7 +96,7 @@ class Placements(GeometryFit):
                 yield str(frame)
         rms_mm = 1e3 * self.fit.errors[1].rms
         yield f"{poses} poses, {rms_mm:.3g} mm rms residual; σ follows from it, the arm's random errors included"
-        yield from self.warnings
+        yield from map(str, self.warnings)
         if poses < USUAL_POSES:
             yield f"{poses} poses are few: measure {USUAL_POSES}, with the wrist turned by 90° and more between them"
 

@@ -45,7 +45,7 @@ from fnmatch import fnmatchcase
 from importlib import resources
 from itertools import product
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from annotated_types import MinLen
 
@@ -279,7 +279,7 @@ def _check_method(path: Path, key: str, name: str) -> None:
 
 def _expanded(study: StudyFile) -> list[Condition]:
     """Return the conditions of a study: all combinations of its values, each with a name."""
-    axes: dict[str, tuple[object, ...]] = {
+    axes: dict[str, tuple[Any, ...]] = {
         "robot": study.robot,
         "motion": study.motion,
         "rate": study.rate,

@@ -30,7 +30,7 @@ from calib.toolkit.model_identification import (
     repeated_motion,
 )
 from calib.toolkit.report_pages import Block, RecordColumn, Section, Text, table
-from calib.toolkit.result_folders import Verdict, lines_of
+from calib.toolkit.result_folders import Note, Verdict, as_notes, lines_of, notes_of
 from calib.toolkit.torque_models import METHODS, Case, IdentificationSettings, Method, method_named, predict
 
 # Of the rule above (our choices).
@@ -79,7 +79,7 @@ class ComparedMethod:
     iterations: int = 0
     simulations: int = 0
     verdict: Verdict | None = None
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Note, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,25 +156,29 @@ def compare_methods(
     return ranked + failed
 
 
-def caveats(inputs: IdentificationInputs, compared: Sequence[ComparedMethod]) -> list[str]:
+def caveats(inputs: IdentificationInputs, compared: Sequence[ComparedMethod]) -> list[Note]:
     """Return notes on a ranking, and the reason if no method is recommended."""
     repeated = repeated_motion(inputs.cases, inputs.unseen)
-    notes = [*inputs.currents.notes, *lines_of(motion_findings({}, repeated))]
+    notes = [Note(note) for note in inputs.currents.notes]
+    notes += notes_of(motion_findings({}, repeated))
     for method in compared:
         notes += method.warnings
     if len(repeated) == len(inputs.unseen):
-        notes.append("no method recommended: all unseen files repeat the training motion; give others with --validate")
+        message = "no method recommended: all unseen files repeat the training motion; give others with --validate"
+        notes.append(Note(message))
     elif repeated:
-        notes.append(f"excluded from the ranking: {', '.join(repeated)}")
+        notes.append(Note(f"excluded from the ranking: {', '.join(repeated)}"))
     if compared and compared[0].unseen >= NO_MODEL:
-        notes.append(
+        message = (
             f"no method recommended: best unseen error {compared[0].unseen:.3g} %, without a model {NO_MODEL:g} %: "
             "add training motion"
         )
+        notes.append(Note(message))
     else:
         for method in compared:
             if method.verdict is not None and method.verdict.level == "fail":
-                notes.append(f"no method recommended: the model of {method.name} fails in calib identify, reason below")
+                message = f"no method recommended: the model of {method.name} fails in calib identify, reason below"
+                notes.append(Note(message))
                 break
     return list(dict.fromkeys(notes))
 
@@ -211,10 +215,11 @@ def _judged(
     Args:
         proven: whether the recordings are motion that it has not seen.
     """
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Note, ...] = ()
     try:
         outcome = judged(inputs, model, partial(_say_of, say, method.name))
-        verdict, warnings = outcome.verdict, outcome.warnings
+        verdict = outcome.verdict
+        warnings = tuple(as_notes(outcome.warnings, outcome.noticed))
     except CalibError as error:
         verdict = Verdict("fail", _one_line(error))
     recommended = proven and method.unseen < NO_MODEL and verdict.level != "fail"
@@ -384,7 +389,7 @@ def line(method: ComparedMethod) -> str:
     return f"{method.name}: {method.unseen:.3g} % on unseen motion, {method.seconds:.2g} s"
 
 
-def section(compared: Sequence[ComparedMethod], notes: Sequence[str]) -> Section:
+def section(compared: Sequence[ComparedMethod], notes: Sequence[Note]) -> Section:
     """Return a report section: table of methods, notes, and the verdict on the selected method's model."""
     blocks = [*_blocks(compared), Text("", notes, "note")]
     for method in compared:

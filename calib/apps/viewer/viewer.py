@@ -22,6 +22,9 @@ from calib.toolkit.result_folders import DrawnRobot as Drawn
 from calib.toolkit.result_folders import ErrorSizes, Measured, Played, Scene, Torques, drawn, strips, thinned
 from calib.transforms import to_quaternion
 
+if TYPE_CHECKING:
+    from rerun import RecordingStream, TimeColumn
+
 # colours, red, green and blue
 ARM = [90, 100, 115]
 BEFORE = [213, 94, 0]

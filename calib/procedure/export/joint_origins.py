@@ -7,6 +7,7 @@ YAML 1.1 takes 1e-05 for text; a key that could be read as something else is quo
 import json
 import re
 from collections.abc import Mapping
+from typing import cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -30,10 +31,10 @@ def block(value: Mapping[str, object], indent: str = "") -> str:
     return "".join(lines)
 
 
-def _scalar(value: float | str) -> str:
+def _scalar(value: object) -> str:
     if isinstance(value, str):
         return _text(value)
-    digits, e, exponent = repr(float(value)).partition("e")
+    digits, e, exponent = repr(float(cast(float, value))).partition("e")
     return digits + ("" if "." in digits else ".0") + e + exponent
 
 
