@@ -301,7 +301,7 @@ def located(loc: Sequence[int | str], table: object = None) -> str:
     return result
 
 
-def _content(table: Any, key: Any) -> Any:
+def _content(table: object, key: object) -> object:
     """Return the value under a key of a table or at an index of a list; None where there is none."""
     if isinstance(table, Mapping):
         return table.get(key)
