@@ -272,6 +272,12 @@ def test_a_stored_result_keeps_the_protocol(kind, results, tmp_path):
                 ask()
 
 
+@pytest.mark.parametrize("kind", ["fit", "identification"])
+def test_a_delivery_states_the_results_verdict(kind, results, capsys):
+    assert cli.run(["deliver", str(results / kind), "--for", "ur"]) in (0, 1)
+    assert f"verdict {open_result(results / kind).verdict.level}: " in capsys.readouterr().out
+
+
 def test_each_kind_is_recognised(results):
     for name in WORKS:
         kind = kind_of(results / name)

@@ -52,17 +52,22 @@ def optional(value: object) -> Any:
 class SavedResult(Protocol):
     """A result that can be written to a folder."""
 
-    def save(self, out: str | Path, *, plots: bool = True) -> Path: ...
+    def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
+        """Write the result's folder."""
+        ...
 
 
 @contextmanager
 def saved(result: str | Path | SavedResult) -> Iterator[Path]:
-    """Yield the folder of a result: a given path unchanged, or a temporary folder of a result in memory."""
+    """Yield the folder of a result: a given path unchanged, or a temporary folder (or file) of a result in memory."""
     if isinstance(result, (str, Path)):
         yield Path(result)
-    else:
-        with TemporaryDirectory() as folder:
-            yield result.save(Path(folder) / "result", plots=False)
+        return
+    name = "result"
+    if isinstance(result, Kept) and result.kind.companion:
+        name = "result.csv"
+    with TemporaryDirectory() as folder:
+        yield result.save(Path(folder) / name, plots=False)
 
 
 def as_text(renderables: Iterable[object]) -> str:
@@ -97,7 +102,7 @@ class Kept(Shown, ABC):
     kind: ClassVar[ResultKind]
 
     @abstractmethod
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
         """Write the result's folder."""
 
     def figures(self) -> Mapping[str, Picture]:

@@ -23,6 +23,7 @@ from calib.results.result import Exported, ExportSettings, StoredResult, Viewed
 from calib.robot.library import resolve
 
 if TYPE_CHECKING:
+    from calib.data.csv_table import Table
     from calib.procedure.report.certificate.record import Certificate, Page
     from calib.procedure.report.page import Picture
 
@@ -145,6 +146,10 @@ class StoredSession(Viewed):
     def session(self) -> Session:
         return self._session
 
+    def require_session(self) -> Session:
+        """Return the session."""
+        return self.session
+
     @property
     def finished(self) -> bool:
         """Whether the session has come to a verdict."""
@@ -177,13 +182,28 @@ class StoredSession(Viewed):
 
     def figures(self) -> dict[str, Picture]:
         """Return the figures of the steps by name, as ``4-fit/map``."""
-        result = {}
-        for folder in (self.fit, self.identification):
-            if folder is None:
-                continue
-            for name, picture in StoredResult(folder.path).figures().items():
-                result[f"{folder.path.name}/{name}"] = picture
-        return result
+        figures = {}
+        for step in self._calibrations():
+            for name, picture in step.figures().items():
+                figures[f"{step.path.name}/{name}"] = picture
+        return figures
+
+    def tables(self) -> dict[str, Table]:
+        """Return the tables of the steps by name, as ``4-fit/estimate``."""
+        tables = {}
+        for step in self._calibrations():
+            for name, table in step.tables().items():
+                tables[f"{step.path.name}/{name}"] = table
+        return tables
+
+    def _calibrations(self) -> list[StoredResult]:
+        """Return the fit and the identification, as far as the session has come."""
+        results: list[StoredResult] = []
+        if self.fit is not None:
+            results.append(StoredFit(self.fit.path))
+        if self.identification is not None:
+            results.append(StoredIdentification(self.identification.path))
+        return results
 
     def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
         """Return certificate and report of a finished session."""

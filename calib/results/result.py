@@ -11,8 +11,9 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, NoReturn, Protocol, runtime_checkable
 
+from calib.config_types import ParsedTable
 from calib.data.csv_table import Table, read_table
 from calib.errors import CalibError, SessionError, UsageError
 from calib.folders import METRICS, write_staged
@@ -48,7 +49,7 @@ class Result(Protocol):
         """The verdict; its level is `NOT_JUDGED` for what has none, as a motion."""
         ...
 
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
         """Write the result's folder (of a list of poses its files), and return its path."""
         ...
 
@@ -140,11 +141,15 @@ class StoredResult:
     def check_arm(self, verb: str) -> None:
         """Refuse a robot of another kind than a serial arm, of which the verb does not take results."""
 
+    def require_session(self) -> Session:
+        """Refuse: this is no session."""
+        self.refuse("session", SessionError)
+
     def motion(self) -> Path:
         """Refuse: there is no motion to play."""
         self.refuse("program")
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> ParsedTable:
         """Return the content of ``metrics.json``; empty without."""
         metrics = self.path / METRICS
         if not metrics.is_file():

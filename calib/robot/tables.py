@@ -14,8 +14,9 @@ import numpy as np
 import rtoml
 
 from calib import config, config_types
-from calib.config_types import Angle, Checked, Length, Name, ParsedTable, Real, Text, shown
+from calib.config_types import Angle, Checked, Length, Name, Real, Text, shown
 from calib.errors import RobotError, refuse_robot
+from calib.records import FieldValues
 from calib.robot.chain import Chain
 from calib.transforms import from_xyz_rpy, to_xyz_rpy
 
@@ -108,9 +109,9 @@ class RobotTable:
     truth: Foreign = None
     provenance: Foreign = None
 
-    def chain_fields(self, where: str) -> ParsedTable:
+    def chain_fields(self, where: str) -> FieldValues:
         """Return the fields of a `Chain` that these keys give; `where` names the file in complaints."""
-        result: ParsedTable = {"name": self.name, "floor": self.floor}
+        result: FieldValues = {"name": self.name, "floor": self.floor}
         if self.base is not None:
             result["base"] = self.base
         if self.tip is not None:

@@ -18,8 +18,8 @@ from calib.errors import SessionError, UsageError, command_line, require
 from calib.records import plain
 from calib.result_kinds import BY_NAME
 from calib.toolkit.report_pages import RecordColumn, Section, table
-from calib.toolkit.result_folders import ChartedResult, Judged, Unjudged
-from calib.toolkit.sessions import Session, folders_of, open_session, position_errors, torque_error
+from calib.toolkit.result_folders import ChartedResult, Judged, Unjudged, open_result
+from calib.toolkit.sessions import Session, folders_of, position_errors, torque_error
 
 if TYPE_CHECKING:
     from calib.toolkit.report_charts import Chart
@@ -198,7 +198,7 @@ def log(folders: Sequence[str | Path], *, mixed: bool = False) -> RobotLog:
         RobotError: where their nominal geometries differ.
         SessionError: for a session that has not come to a verdict.
     """
-    sessions = [open_session(Path(path)) for path in folders_of(folders)]
+    sessions = [open_result(path, "session").require_session() for path in folders_of(folders)]
     sessions.sort(key=_created)
     _check_same("robots", [session.settings.name for session in sessions], mixed)
     _check_same("serial numbers", [_serial(session) for session in sessions], mixed)

@@ -308,7 +308,7 @@ def _expanded(study: StudyFile) -> list[Condition]:
     return conditions
 
 
-def _name_part(axis: str, value: Any) -> str:
+def _name_part(axis: str, value: object) -> str:
     """Return how a value appears in the name of its condition."""
     if axis == "cutoff":
         return f"{value:g}Hz" if value else "unfiltered"

@@ -4,13 +4,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any
 
 import numpy as np
 
 from calib.apps.studies.conditions import Condition
 from calib.apps.studies.experiment import Experiment, make_experiment, set_up
 from calib.errors import CalibError
+from calib.records import FieldValues
 from calib.toolkit.simulations import Plant, Sensing, published_controller, simulate
 from calib.toolkit.torque_models import VERSIONS, Dynamics, EstimateStatus, MethodEstimate, method_named, predict
 
@@ -118,7 +118,7 @@ def run_trials(trials: Trials) -> list[TrialRow]:
 
 def run_trial(condition: Condition, method: str, seed: int) -> TrialRow:
     """Return the row of a condition, a method and a seed; always the same, except for the times."""
-    head: dict[str, Any] = {
+    head: FieldValues = {
         "condition": condition.name,
         "digest": condition.digest,
         "method": method,
@@ -152,7 +152,7 @@ def run_trial(condition: Condition, method: str, seed: int) -> TrialRow:
     return TrialRow(status=FOUND, message="", **head, **merit)
 
 
-def _merit(data: Experiment, outcome: MethodEstimate, values: np.ndarray) -> dict[str, Any]:
+def _merit(data: Experiment, outcome: MethodEstimate, values: np.ndarray) -> FieldValues:
     """Return the figures of merit of an estimate with base parameters (b,), all but ``survey_q``."""
     error = values - data.truth
     torque_error = data.matrix @ values - data.torque

@@ -71,7 +71,7 @@ class ChangePart(ABC):
         """Return an error as text with its unit."""
 
     @abstractmethod
-    def numbers(self) -> dict[str, Any]:
+    def numbers(self) -> dict[str, object]:
         """Return the numbers that this kind alone has [SI]."""
 
     @cached_property
@@ -129,7 +129,7 @@ class ChangePart(ABC):
     def basis(self) -> str:
         """On what `today` rests."""
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the numbers as in ``metrics.json`` [SI]."""
         change_test: ChangeTest = self.found
         return {

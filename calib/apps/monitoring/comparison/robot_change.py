@@ -113,7 +113,7 @@ class RobotChange(ChartedResult, Judged):
         part = self.parts[0]
         return part.before.name, part.after.name, part.before.robot.chain.name
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the numbers as in ``metrics.json`` [SI]."""
         before, after, _ = self._names
         numbers: dict[str, Any] = {
