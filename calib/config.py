@@ -14,7 +14,7 @@ from dataclasses import fields, is_dataclass
 from functools import cache
 from inspect import cleandoc
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
 from calib.config_types import UNKNOWN, Hidden, OneOf, ParsedTable, shown
 from calib.errors import CalibError, UsageError, suggestion
@@ -234,7 +234,7 @@ def described(source: object) -> dict[str, str]:
         descriptions |= _entries(base.__doc__ or "")
     for name, text in descriptions.items():
         if OTHERS in text:
-            descriptions[name] = text.replace(OTHERS, ", ".join(_others(source, name)))
+            descriptions[name] = text.replace(OTHERS, ", ".join(_others(cast(type, source), name)))
     return descriptions
 
 

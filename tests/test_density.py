@@ -24,7 +24,7 @@ REMEDIES = {
     "nested_per_100_statements": "split the statements that hold three or more comprehensions or conditionals",
     "empty_names_percent": "name variables by what they hold, by none of EMPTY_WORDS in tests/support/code_density.py",
     "fmt_skip": "let the formatter decide",
-    "any_annotations": "say the type: object, a Protocol, a TypeVar, or an alias such as calib.config_types.ParsedTable",
+    "any_annotations": "say the type: object, a Protocol, a TypeVar, or an alias such as config_types.ParsedTable",
 }
 LOWER = "python tests/support/code_density.py --lower"
 

@@ -22,7 +22,7 @@ from calib.parallel.mechanism.closure import closed
 from calib.parallel.mechanism.geometric_fit import changed, loop_parameters
 from calib.parallel.robots import find
 from calib.procedure.kinematic_stage.folder import FitFolder
-from calib.results import scene
+from calib.results import scene_files as scene
 from calib.robot import calibrated, description
 from calib.robot.chain import random_joints
 from calib.robot.library import load

@@ -81,7 +81,7 @@ class PoseSelection(ChartedResult, Unjudged, selection.Chosen):
         from calib.procedure.report.geometry_figures import outlook_figure, predicted_map
 
         result: dict[str, Chart] = {}
-        for name in self.figures:
+        for name in self.figure_names:
             if name == "predicted":
                 selected = self.outlook.poses
                 result[name] = predicted_map(selected.points, selected.spread)

@@ -97,7 +97,7 @@ class Kept(Shown, ABC):
     kind: ClassVar[ResultKind]
 
     @abstractmethod
-    def save(self, out: str | Path, *, plots: bool = True) -> Path:
+    def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
         """Write the result's folder."""
 
     def figures(self) -> Mapping[str, Picture]:

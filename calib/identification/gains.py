@@ -114,9 +114,11 @@ class GainRecord:
     def of(cls, gains: DriveGains, unit: str) -> GainRecord:
         """Return the record of estimated gains; `unit` is the torques' unit."""
         status = np.array(gains.told)
+        values = np.where(status == "not told", np.nan, gains.gains)
+        sigma = np.where(status == "told", gains.sigma, np.nan)
         return cls(
-            values=np.where(status == "not told", np.nan, gains.gains),
-            sigma=np.where(status == "told", gains.sigma, np.nan),
+            values=values,
+            sigma=sigma,
             told=gains.told,
             covariance=gains.covariance,
             unit=f"{unit} per A",
@@ -171,7 +173,8 @@ def identify_gains(
     else:
         gains = _start(columns, load, current)
     x = _parameters(columns, load, current, gains)
-    moving = np.array([joint for joint in range(n) if joint != reference and joint not in own], dtype=int)
+    fitted = [joint for joint in range(n) if joint != reference and joint not in own]
+    moving = np.array(fitted, dtype=int)
     for _ in range(MAX_ROUNDS):
         torque = columns @ x + load
         residual = torque / gains[:, None] - current
@@ -183,9 +186,11 @@ def identify_gains(
         rows = np.concatenate([by_x, by_gain, residual[:, :, None]], axis=2)
         noise = std * np.sqrt(inflation)
         rows = rows / noise[:, None, None]
-        triangle = retriangulate(rows.reshape(-1, rows.shape[2]))
+        stacked = rows.reshape(-1, rows.shape[2])
+        triangle = retriangulate(stacked)
         upper = triangle[:-1, :-1]
-        step = -np.linalg.lstsq(upper, triangle[:-1, -1], rcond=1e-12)[0]
+        solution = np.linalg.lstsq(upper, triangle[:-1, -1], rcond=1e-12)[0]
+        step = -solution
         x_step = step[: len(free)]
         gain_step = step[len(free) :]
         largest = float(np.abs(gain_step).max())
@@ -204,7 +209,8 @@ def identify_gains(
             gains,
         )
     inverse = np.linalg.pinv(upper, rcond=1e-12)
-    covariance = (inverse @ inverse.T)[len(free) :, len(free) :] * np.outer(gains, gains)
+    relative = (inverse @ inverse.T)[len(free) :, len(free) :]
+    covariance = relative * np.outer(gains, gains)
     values = np.zeros(len(names))
     values[free] = x / norms
     values[fixed] = fixed_values
@@ -235,7 +241,8 @@ def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray,
     unidentified: tuple[int, ...] = ()
     while True:
         try:
-            fit = identify_gains(pool(data, joints, blocks), {}, inflation, reference=reference, own=unidentified)
+            currents = pool(data, joints, blocks)
+            fit = identify_gains(currents, {}, inflation, reference=reference, own=unidentified)
         except NotConverged as error:
             unidentified = (*unidentified, _most_distant(error, reference, unidentified))
             continue
@@ -246,11 +253,14 @@ def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray,
         free[[reference, *unidentified]] = False
         log_gains = np.log(fit.gains)
         distance = np.abs(log_gains - np.median(log_gains))
-        doubt = np.where(free, np.maximum(sigma / MAX_SIGMA, distance / np.log(MAX_FACTOR)), 0.0)
+        by_distance = distance / np.log(MAX_FACTOR)
+        doubt = np.where(free, np.maximum(sigma / MAX_SIGMA, by_distance), 0.0)
         if doubt.max() <= 1.0:
             estimated = free & (formal_sigma > 0.0)
-            factor = np.where(estimated, sigma / np.where(formal_sigma > 0.0, formal_sigma, 1.0), 1.0)
-            return replace(fit, covariance=frozen(fit.covariance * np.outer(factor, factor)))
+            safe_sigma = np.where(formal_sigma > 0.0, formal_sigma, 1.0)
+            factor = np.where(estimated, sigma / safe_sigma, 1.0)
+            covariance = frozen(fit.covariance * np.outer(factor, factor))
+            return replace(fit, covariance=covariance)
         unidentified = (*unidentified, int(np.argmax(doubt)))
 
 
@@ -270,14 +280,16 @@ def _jackknife(
     for block in blocks:
         remaining = pool(data, joints, [other for other in blocks if other != block])
         try:
-            part = identify_gains(remaining, {}, inflation, fit.gains.tolist(), reference, unidentified)
+            start = fit.gains.tolist()
+            part = identify_gains(remaining, {}, inflation, start, reference, unidentified)
             log_gains.append(np.log(part.gains))
         except NotConverged:
             log_gains.append(np.where(np.arange(joints) == reference, 0.0, np.inf))
     with np.errstate(invalid="ignore"):
         deviation = np.array(log_gains) - np.mean(log_gains, axis=0)
     squares = np.nan_to_num(deviation, nan=np.inf) ** 2
-    return np.sqrt((len(blocks) - 1) / len(blocks) * np.sum(squares, axis=0))
+    factor = (len(blocks) - 1) / len(blocks)
+    return np.sqrt(factor * np.sum(squares, axis=0))
 
 
 def _most_distant(error: NotConverged, reference: int, unidentified: Sequence[int]) -> int:
@@ -302,7 +314,8 @@ def _start(columns: np.ndarray, load: np.ndarray, current: np.ndarray) -> np.nda
     for joint in range(n):
         matrix[joint, :, joint] = current[joint]
     matrix[:, :, n:] = -columns
-    solution, *_ = np.linalg.lstsq(matrix.reshape(-1, n + p), load.ravel(), rcond=1e-12)
+    flat = matrix.reshape(-1, n + p)
+    solution, *_ = np.linalg.lstsq(flat, load.ravel(), rcond=1e-12)
     gains = np.abs(solution[:n])
     median = float(np.median(gains))
     return np.where(gains > MIN_START * median, gains, max(median, 1e-3))
@@ -312,5 +325,6 @@ def _parameters(columns: np.ndarray, load: np.ndarray, current: np.ndarray, gain
     """Return the least-squares parameters (p,) at these gains."""
     matrix = columns / gains[:, None, None]
     target = current - load / gains[:, None]
-    x, *_ = np.linalg.lstsq(matrix.reshape(-1, columns.shape[2]), target.ravel(), rcond=1e-12)
+    flat = matrix.reshape(-1, columns.shape[2])
+    x, *_ = np.linalg.lstsq(flat, target.ravel(), rcond=1e-12)
     return x

@@ -119,16 +119,11 @@ def identify(
     if chain.inertias is not None and np.any(chain.inertias[:, 9] > 0.0):
         cad = standard_parameters(chain)
     moves = model.bodies.coordinates[:, None] >= 0
+    states = chain_states(chain, nominal or model, settings.seed)
+    shape = np.where(moves, rods(chain, model), 0.0).ravel()
+    effort = _torque_limits(chain)
     identification = identify_model(
-        model,
-        cases,
-        settings,
-        nominal=nominal,
-        states=chain_states(chain, nominal or model, settings.seed),
-        cad=cad,
-        shape=np.where(moves, rods(chain, model), 0.0).ravel(),
-        effort=_torque_limits(chain),
-        progress=progress,
+        model, cases, settings, nominal=nominal, states=states, cad=cad, shape=shape, effort=effort, progress=progress
     )
     # The model is that of the chain.
     return cast(Identification, identification)
@@ -195,7 +190,8 @@ def identify_model(
     marks_standstills = isinstance(method, LeastSquares) and isinstance(model, IdentificationModel)
     if any(part.standing.any() for part in rows):
         as_moving = _first_fit(rows_as_moving, find, takes_prior, noise)
-        error = _left_out_error((rows, prior, first), rows, settings)
+        fitted = (rows, prior, first)
+        error = _left_out_error(fitted, rows, settings)
         error_as_moving = _left_out_error(as_moving, rows, settings)
         if error_as_moving < CLEARLY_LESS**2 * error:
             rows, prior, first = as_moving
@@ -222,13 +218,14 @@ def identify_model(
         prior = find(richer_rows, groups=groups, start=prior, tempering=prior.tempering)
         richer_rows = with_weights(richer_rows, prior.first.rest_weights)
 
+    terms = (*_terms_of(model, base), *friction.terms)
     problem = IdentificationProblem(
         model=model,
         base=base,
         cases=cases,
         decimator=decimator,
         rows=tuple(richer_rows),
-        terms=(*_terms_of(model, base), *friction.terms),
+        terms=terms,
         groups=column_groups,
         noise=noise,
         prior=prior,
@@ -359,7 +356,9 @@ def _identified(
 
     say("essential parameters")
     elimination = _essential(fit, settings)
-    base_columns = problem.pooled.factors.reshape(-1, len(values) + 1)[:, : base.b]
+    stacked = problem.pooled.factors.reshape(-1, len(values) + 1)
+    base_columns = stacked[:, : base.b]
+    condition = condition_numbers(base_columns)
     return Identification(
         dynamics=dynamics,
         base=base,
@@ -369,7 +368,7 @@ def _identified(
         settings=settings,
         rows=problem.rows,
         terms=problem.terms,
-        condition=condition_numbers(base_columns),
+        condition=condition,
         prior=problem.prior,
         ripples=ripples,
         loop=loop,
@@ -427,6 +426,7 @@ def _richer_friction(
     for term in model.columns:
         if len(term.acts) > 1:
             coupled.add(tuple(sorted({row for row, _ in term.acts})))
+    v0 = np.array(per_joint(settings.v0, model.n, "v0"))
     candidates = FrictionCandidates(
         cases=cases,
         rows=rows,
@@ -434,7 +434,7 @@ def _richer_friction(
         decimator=decimator,
         std=first.std,
         inflation=inflation,
-        v0=np.array(per_joint(settings.v0, model.n, "v0")),
+        v0=v0,
         linear=model.prismatic,
         prior=prior,
         apart=settings.apart,
@@ -488,10 +488,12 @@ def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) ->
     message = f"recordings of {min(rates):.4g} Hz and {max(rates):.4g} Hz cannot be combined; resample one of them"
     require(max(rates) <= MAX_RATE_RATIO * min(rates), message, MeasurementError)
     total = sum(len(case.motion) for case in cases)
-    widest = design_decimator(rates[0], min(case.motion.decimator.factor for case in cases))
+    rate = rates[0]
+    widest = design_decimator(rate, min(case.motion.decimator.factor for case in cases))
     max_rows = widest.factor * settings.samples
     step = -(-total // max_rows)
-    return replace(widest, factor=step * widest.factor)
+    factor = step * widest.factor
+    return replace(widest, factor=factor)
 
 
 def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> np.ndarray | None:
@@ -524,7 +526,8 @@ def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> n
             )
         variances.append(case.noise**2)
         lengths.append(len(case.motion))
-    return np.asarray(np.sqrt(np.average(variances, axis=0, weights=lengths)))
+    variance = np.average(variances, axis=0, weights=lengths)
+    return np.asarray(np.sqrt(variance))
 
 
 def _takes_prior(method: Method, model: RegressorModel, settings: IdentificationSettings, source: str) -> bool:
@@ -543,15 +546,11 @@ def _essential(fit: MethodEstimate, settings: IdentificationSettings) -> Elimina
     if settings.essential == "none":
         return None
     data, std, inflation = fit.testable()
+    keep = [bases.standard_name(name, data.names) for name in settings.keep]
+    drop = [bases.standard_name(name, data.names) for name in settings.drop]
+    rule = Rule(settings.essential)
     return eliminate(
-        data,
-        Rule(settings.essential),
-        ratio=settings.ratio,
-        level=settings.level,
-        keep=[bases.standard_name(name, data.names) for name in settings.keep],
-        drop=[bases.standard_name(name, data.names) for name in settings.drop],
-        std=std,
-        inflation=inflation,
+        data, rule, ratio=settings.ratio, level=settings.level, keep=keep, drop=drop, std=std, inflation=inflation
     )
 
 

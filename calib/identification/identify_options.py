@@ -228,12 +228,9 @@ class IdentifyOptions:
         """Return the settings of a recording (or a cut of one), with the torques that the model's rows explain."""
         settings = own_table(self.files, parse_cut(str(path))[0]) or self.every
         rows = self.settings.torque_rows
+        samples = settings.recording.samples or USED
         recording = replace(
-            settings.recording,
-            samples=settings.recording.samples or USED,
-            rows=rows.name,
-            motors=rows.driven,
-            sensors=rows.sensed,
+            settings.recording, samples=samples, rows=rows.name, motors=rows.driven, sensors=rows.sensed
         )
         return replace(settings, recording=recording)
 
@@ -252,7 +249,8 @@ def read_options(path: str | Path | None = None) -> IdentifyOptions:
 def parse_options(table: Mapping[str, object], source: str = "options") -> IdentifyOptions:
     """Return the options in a parsed TOML table; `source` names the file in messages."""
     for key in table.keys() & REMOVED.keys():
-        refuse_option(f"{source}: {key}", REMOVED[key])
+        message = REMOVED[key]
+        refuse_option(f"{source}: {key}", message)
     # Payloads are bodies here and their labels in [files], so that they are not handed down.
     handed_down = {key: value for key, value in table.items() if key != "payload"}
     keys = inherited(handed_down, FileSettings)
@@ -275,20 +273,23 @@ def options_of(keys: IdentifySettings, source: str = "settings") -> IdentifyOpti
     terms = []
     for number, row in enumerate(keys.term, 1):
         with refused_as(UsageError, CalibError, f"{source}: [[term]] number {number}: {{}}"):
-            terms.append(term(row.name, row.shape, row.joint, *row.settings, side=row.side))
+            drive_term = term(row.name, row.shape, row.joint, *row.settings, side=row.side)
+            terms.append(drive_term)
+    torque_rows = ROWS[keys.rows]
     settings = IdentificationSettings(
         **choices,
         sets=keys.drives,
-        torque_rows=ROWS[keys.rows],
+        torque_rows=torque_rows,
         couplings=keys.coupling,
         terms=tuple(terms),
         payloads=keys.payload,
     )
     for name, file in keys.files.items():
         check_keys(dict.fromkeys(file.payload), keys.payload, f'{source}: files."{name}".payload')
+    every = FileSettings(keys.recording, keys.filter, gains=keys.gains)
     return IdentifyOptions(
         settings=settings,
-        every=FileSettings(keys.recording, keys.filter, gains=keys.gains),
+        every=every,
         files=keys.files,
         slow=keys.slow,
         gain_pair=keys.gain_identification,

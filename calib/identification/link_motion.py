@@ -46,17 +46,21 @@ def with_link_motion(robot: CalibratedChain, case: Case, settings: Identificatio
             bases = motion_of_bases(chosen, case.motion, torque)
             positions[:, :, j] = np.einsum("e,sen->sn", np.asarray(chosen.coefficients), bases)
     motion = case.motion
-    return replace(case, link=tuple(x + dx for x, dx in zip((motion.q, motion.v, motion.a), positions)))
+    orders = (motion.q, motion.v, motion.a)
+    link = tuple(order + displacement for order, displacement in zip(orders, positions))
+    return replace(case, link=link)
 
 
 def joint_terms(chain: Chain, deflection: Deflection) -> Deflection:
     """Return the terms that move joints, which the dynamics follow."""
-    return chosen_terms(deflection, np.isin(target_elements(chain, deflection), chain.moving))
+    mask = np.isin(target_elements(chain, deflection), chain.moving)
+    return chosen_terms(deflection, mask)
 
 
 def chosen_terms(deflection: Deflection, mask: np.ndarray) -> Deflection:
     terms = tuple(term for term, chosen in zip(deflection.terms, mask) if chosen)
-    return replace(deflection, terms=terms, coefficients=np.asarray(deflection.coefficients)[mask])
+    coefficients = np.asarray(deflection.coefficients)[mask]
+    return replace(deflection, terms=terms, coefficients=coefficients)
 
 
 def bodies_torques(terms: Deflection, case: Case, settings: IdentificationSettings) -> np.ndarray | None:
@@ -73,7 +77,8 @@ def bodies_torques(terms: Deflection, case: Case, settings: IdentificationSettin
             first = 10 * model.bodies.labels.index(label)
             values[first : first + 10] = load
     motion = case.motion
-    return motion.in_band(model.transmitted(values, motion.q, motion.v, motion.a, case.carried))
+    torque = model.transmitted(values, motion.q, motion.v, motion.a, case.carried)
+    return motion.in_band(torque)
 
 
 def motion_of_bases(terms: Deflection, motion: Motion, torque: np.ndarray | None) -> np.ndarray:
@@ -82,5 +87,6 @@ def motion_of_bases(terms: Deflection, motion: Motion, torque: np.ndarray | None
     result[0] = evaluate(terms, motion.q, torque)
     for start, stop in segments(motion.segment):
         for order in (1, 2) if stop - start > 2 else ():
-            result[order, :, start:stop] = np.gradient(result[order - 1, :, start:stop], 1.0 / motion.rate, axis=1)
+            previous = result[order - 1, :, start:stop]
+            result[order, :, start:stop] = np.gradient(previous, 1.0 / motion.rate, axis=1)
     return result

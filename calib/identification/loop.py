@@ -192,7 +192,8 @@ class LoopController:
     def __post_init__(self) -> None:
         n = len(np.atleast_1d(self.kp))
         for name in ("kp", "kd", "ki", "share", "limit", "windup"):
-            value = np.broadcast_to(np.asarray(getattr(self, name), dtype=float), (n,))
+            stated = np.asarray(getattr(self, name), dtype=float)
+            value = np.broadcast_to(stated, (n,))
             object.__setattr__(self, name, frozen(np.array(value)))
         require(self.delay >= 0, f"a delay of {self.delay} control periods is invalid")
 
@@ -203,15 +204,24 @@ class LoopController:
 
     def smoothing(self, period: float) -> float:
         """Return the weight of a new velocity sample in the low-pass."""
-        return 1.0 if self.cutoff is None else float(1.0 - np.exp(-2.0 * np.pi * self.cutoff * period))
+        if self.cutoff is None:
+            return 1.0
+        decay = np.exp(-2.0 * np.pi * self.cutoff * period)
+        return float(1.0 - decay)
 
     def scaled(self, factor: np.ndarray | float) -> LoopController:
         """Return the controller with all gains times `factor`, one or (n,): the same bandwidth at another inertia."""
-        return replace(self, kp=self.kp * factor, kd=self.kd * factor, ki=self.ki * factor)
+        kp = self.kp * factor
+        kd = self.kd * factor
+        ki = self.ki * factor
+        return replace(self, kp=kp, kd=kd, ki=ki)
 
     def slower(self, factor: float) -> LoopController:
         """Return the controller with its bandwidth divided by `factor`: kp by factor², kd by factor, ki by factor³."""
-        return replace(self, kp=self.kp / factor**2, kd=self.kd / factor, ki=self.ki / factor**3)
+        kp = self.kp / factor**2
+        kd = self.kd / factor
+        ki = self.ki / factor**3
+        return replace(self, kp=kp, kd=kd, ki=ki)
 
     def with_feedforward(self, ahead: np.ndarray) -> LoopController:
         """Return the controller with a feedforward torque (N, n) added."""
@@ -343,4 +353,5 @@ class Replay:
     @stored
     def feedback_over_model(self) -> float:
         """Ratio of the tracking errors without and with the model as feedforward, geometric mean over the joints."""
-        return float(np.exp(np.mean(np.log(self.rms[FEEDBACK] / np.maximum(self.rms[IDENTIFIED], 1e-12)))))
+        ratio = self.rms[FEEDBACK] / np.maximum(self.rms[IDENTIFIED], 1e-12)
+        return float(np.exp(np.mean(np.log(ratio))))

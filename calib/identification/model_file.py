@@ -153,6 +153,7 @@ def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, ob
     for term, value in zip(model.columns, dynamics.values[inertial:]):
         acts = [[row, [list(pair) for pair in motion]] for row, motion in term.acts]
         settings = [float(setting) if np.isfinite(setting) else "inf" for setting in term.settings]
+        term_unit = per_ampere(term.unit, unit)
         terms.append(
             {
                 "name": term.name,
@@ -162,18 +163,20 @@ def to_table(dynamics: Dynamics, base: Base, unit: str = TORQUE) -> dict[str, ob
                 "side": term.side,
                 "linear": term.linear,
                 "value": float(value),
-                "unit": per_ampere(term.unit, unit),
+                "unit": term_unit,
             }
         )
+    bodies = dict(zip(model.names[:inertial], dynamics.values[:inertial].tolist()))
+    base_expressions = dict(zip(base.names, expressions(base)))
     return {
         "robot": ROBOT,
         "kind": model.torque_rows.name,
         "unit": unit,
         "gravity": model.bodies.gravity.tolist(),
         "payloads": payloads,
-        "bodies": dict(zip(model.names[:inertial], dynamics.values[:inertial].tolist())),
+        "bodies": bodies,
         "terms": terms,
-        "base": dict(zip(base.names, expressions(base))),
+        "base": base_expressions,
         "regrouping": regrouping(base),
         "covariance": folders.COVARIANCE,
         "note": NOTE,
@@ -184,7 +187,8 @@ def regrouping(base: Base) -> dict[str, dict[str, float]]:
     """Return for each base parameter its standard parameters and their coefficients."""
     coefficients = {}
     for name, row in zip(base.names, base.transform):
-        coefficients[name] = {base.standard[column]: float(row[column]) for column in np.flatnonzero(row)}
+        used = np.flatnonzero(row)
+        coefficients[name] = {base.standard[column]: float(row[column]) for column in used}
     return coefficients
 
 
@@ -192,7 +196,9 @@ def from_table(chain: Chain, table: ParsedTable) -> Dynamics:
     """Return the model of a chain from a table that `to_table` made."""
     bodies = bodies_of(chain).with_gravity(np.array(table["gravity"], dtype=float))
     for label in table.get("payloads", ()):
-        bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
+        on = chain.n - 1
+        placement = np.asarray(chain.tail)
+        bodies = with_payload(bodies, placement, label, on=on)
     terms = tuple(_term(entry) for entry in table["terms"])
     model = IdentificationModel(bodies, terms, torque_rows(table.get("kind", "motor")))
     inertial_values = table["bodies"]
@@ -211,7 +217,11 @@ def _term(entry: ParsedTable) -> DriveTerm:
         weights = tuple((int(joint), float(weight)) for joint, weight in motion)
         acts.append((int(row), weights))
     settings = tuple(float(setting) for setting in entry["settings"])
-    return DriveTerm(entry["name"], entry["shape"], tuple(acts), settings, entry["side"], bool(entry["linear"]))
+    name = entry["name"]
+    shape = entry["shape"]
+    side = entry["side"]
+    linear = bool(entry["linear"])
+    return DriveTerm(name, shape, tuple(acts), settings, side, linear)
 
 
 def identified_masses(folder: str | Path, chain: Chain) -> np.ndarray:

@@ -150,7 +150,8 @@ def relative_error_sigma(measured: np.ndarray, predicted: np.ndarray) -> float:
     if count < 2 * JACKKNIFE_BLOCKS:
         return np.nan
     starts = np.linspace(0, count, JACKKNIFE_BLOCKS, endpoint=False).astype(int)
-    error = np.add.reduceat(np.sum((measured - predicted) ** 2, axis=0), starts)
+    squares = np.sum((measured - predicted) ** 2, axis=0)
+    error = np.add.reduceat(squares, starts)
     torque = np.add.reduceat(np.sum(measured**2, axis=0), starts)
     remaining_torque = torque.sum() - torque
     if not (remaining_torque > 0.0).all():
@@ -179,23 +180,33 @@ def score(
     residuals = []
     for row in range(case.target.shape[1]):
         row_moves = moves[:, row % motion.n]
-        row_sums, row_above, row_explained, residual = _score_row(case, np.asarray(predicted)[:, row], row, row_moves)
+        row_predicted = np.asarray(predicted)[:, row]
+        row_sums, row_above, row_explained, residual = _score_row(case, row_predicted, row, row_moves)
         sums.append(row_sums)
         above.append(row_above)
         explained.append(row_explained)
         residuals.append(residual)
     raw, filtered, in_motion, at_rest = np.stack(sums, axis=1)
     step = motion.decimator.factor
+    standing = _prediction_errors(at_rest, apart)
+    above_band_percent = np.array(above)
+    segment = motion.segment[::step]
+    whiteness = _whiteness(np.stack(residuals, axis=1), segment)
+    rate = motion.rate / step
+    motion_share = float(moves.mean())
+    raw_errors = _prediction_errors(raw, apart)
+    filtered_errors = _prediction_errors(filtered, apart)
+    moving_errors = _prediction_errors(in_motion, apart)
     return Score(
-        raw=_prediction_errors(raw, apart),
-        filtered=_prediction_errors(filtered, apart),
-        moving=_prediction_errors(in_motion, apart),
-        standing=_prediction_errors(at_rest, apart),
-        above_band_percent=np.array(above),
+        raw=raw_errors,
+        filtered=filtered_errors,
+        moving=moving_errors,
+        standing=standing,
+        above_band_percent=above_band_percent,
         r_squared=np.array(explained),
-        whiteness=_whiteness(np.stack(residuals, axis=1), motion.segment[::step]),
-        rate=motion.rate / step,
-        motion_share=float(moves.mean()),
+        whiteness=whiteness,
+        rate=rate,
+        motion_share=motion_share,
     )
 
 
@@ -214,12 +225,11 @@ def _score_row(
     residual = target - predicted
     target_in_band, predicted_in_band = motion.in_band(np.stack([target, predicted], axis=1)).T
     residual_in_band = target_in_band - predicted_in_band
-    sums = [
-        _sums(target, residual, valid),
-        _sums(target_in_band, residual_in_band, valid),
-        _sums(target, residual, valid & moves),
-        _sums(target, residual, valid & ~moves),
-    ]
+    in_motion = _sums(target, residual, valid & moves)
+    at_rest = _sums(target, residual, valid & ~moves)
+    raw = _sums(target, residual, valid)
+    filtered = _sums(target_in_band, residual_in_band, valid)
+    sums = [raw, filtered, in_motion, at_rest]
     size = float(np.linalg.norm(target))
     above = 0.0
     if size > 0.0:
@@ -242,9 +252,11 @@ def _prediction_errors(sums: np.ndarray, apart: Sequence[int]) -> PredictionErro
     with np.errstate(divide="ignore", invalid="ignore"):
         joints = 100.0 * np.sqrt(square / size)
         rms = np.sqrt(square / count)
-        total = float(100.0 * np.sqrt(square[same_unit].sum() / size[same_unit].sum()))
+        share = square[same_unit].sum() / size[same_unit].sum()
+        total = float(100.0 * np.sqrt(share))
     relative = RelativeErrors(total, np.where(size > 0.0, joints, np.nan))
-    return PredictionErrors(relative, np.where(count > 0, rms, np.nan), int(count.sum()))
+    samples = int(count.sum())
+    return PredictionErrors(relative, np.where(count > 0, rms, np.nan), samples)
 
 
 def _whiteness(residual: np.ndarray, segment: np.ndarray) -> tuple[Whiteness | None, ...]:
@@ -294,5 +306,6 @@ def predict(dynamics: Dynamics[RegressorModel], case: Case) -> np.ndarray:
         q = motion.q[part]
         v = motion.v[part]
         a = motion.a[part]
-        result[part] = model.torque(dynamics.values, q, v, a, case.carried, states[:, part], **case.deflected(part))
+        deflected = case.deflected(part)
+        result[part] = model.torque(dynamics.values, q, v, a, case.carried, states[:, part], **deflected)
     return result

@@ -208,7 +208,8 @@ def find_prior(
         robot_direction[: len(robot)] = robot
     shared = _shared_directions(model, robot_direction, effort)
     direction_count = shared.shape[1]
-    single = np.asarray(scipy.linalg.block_diag(transform, np.eye(len(groups))))
+    identity = np.eye(len(groups))
+    single = np.asarray(scipy.linalg.block_diag(transform, identity))
     common = np.vstack([transform @ shared, np.zeros((len(groups), direction_count))])
     columns = np.column_stack([single, common])
     sizes = _sizes(model, data, columns, shared, groups)
@@ -228,7 +229,8 @@ def find_prior(
         previous_values, previous_std = values, std
         tempered = tempering * inflation
         noise_of_row = (std * np.sqrt(tempered))[:, None, None]
-        factor = retriangulate((data.factors / noise_of_row).reshape(-1, len(columns) + 1))
+        stacked = (data.factors / noise_of_row).reshape(-1, len(columns) + 1)
+        factor = retriangulate(stacked)
         t = _most_probable(factor, columns, sizes, t)
         values, covariance = _posterior(factor, columns, sizes.deviations(t))
         std, inflation = weighing(rows, data, values, covariance, std, tempered, noise)
@@ -243,12 +245,15 @@ def find_prior(
     common_root = columns[: base.b, -direction_count:] * deviations[-direction_count:]
     single_covariance = single_root @ single_root.T
     single_covariance[np.diag_indices(base.b)] *= 1.0 + 1e-9
+    deviation = frozen(np.sqrt(np.diag(single_covariance)))
+    first = FirstFit(frozen(std), frozen(inflation), frozen(values[: base.b]), rest_weights)
+    prior_covariance = single_covariance + common_root @ common_root.T
     return Prior(
-        covariance=frozen(single_covariance + common_root @ common_root.T),
-        deviation=frozen(np.sqrt(np.diag(single_covariance))),
+        covariance=frozen(prior_covariance),
+        deviation=deviation,
         sizes={name: float(np.exp(log_size)) for name, log_size in zip(sizes.names, t) if name},
         source=source,
-        first=FirstFit(frozen(std), frozen(inflation), frozen(values[: base.b]), rest_weights),
+        first=first,
         tempering=tempering,
     )
 
@@ -295,7 +300,8 @@ def weighing(
     parameters_of_row = np.einsum("gik,gik->g", columns @ covariance, columns) / (std**2 * inflation)
     inflation = np.minimum(residual_inflation(rows, values), MAX_INFLATION)
     counts = np.maximum(data.rows, 1)
-    squares = np.sum((data.factors @ np.append(values, -1.0)) ** 2, axis=1)
+    residual = data.factors @ np.append(values, -1.0)
+    squares = np.sum(residual**2, axis=1)
     freedom = np.maximum(data.rows - inflation * parameters_of_row, 0.1 * counts)
     std = np.sqrt(squares / freedom)
     torque_squares = np.sum(data.factors[:, :, -1] ** 2, axis=1)
@@ -313,7 +319,8 @@ def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.
     """
     if noise is None:
         return std
-    mean_square_ratio = np.average((std / noise) ** 2, weights=np.maximum(counts, 1))
+    weights = np.maximum(counts, 1)
+    mean_square_ratio = np.average((std / noise) ** 2, weights=weights)
     return noise * np.sqrt(mean_square_ratio)
 
 
@@ -373,14 +380,16 @@ def _sizes(
     # Logarithms of the sizes that explain all torque, each alone; of what no torque shows, nothing is known.
     torque_columns = data.factors[:, :, :-1] @ columns
     squares = np.sum(torque_columns**2, axis=(0, 1))
-    total = max(float(np.sum(data.factors[:, :, -1] ** 2)), 1e-300)
+    target_square = np.sum(data.factors[:, :, -1] ** 2)
+    total = max(float(target_square), 1e-300)
     size_squares = np.bincount(member, squares, len(names))
     min_squares = max(1e-12 * float(size_squares.max()), 1e-300)
     explaining = 0.5 * np.log(total / np.maximum(size_squares, min_squares))
 
     # Sizes of the bodies' parameters are within factors of the robot's own parameters of their kind.
     count = np.maximum(np.bincount(member, minlength=len(names)), 1)
-    mean_square = np.bincount(member[: model.p], shared[:, 0] ** 2, len(names)) / count
+    shared_squares = np.bincount(member[: model.p], shared[:, 0] ** 2, len(names))
+    mean_square = shared_squares / count
     of_robot = explaining[single_count] + 0.5 * np.log(np.maximum(mean_square, 1e-300))
     has_robot = mean_square > 0.0
     lower = np.where(has_robot, of_robot + np.log(MIN_CAD_DEVIATION), -np.inf)
@@ -403,7 +412,8 @@ def _posterior(factor: np.ndarray, columns: np.ndarray, deviations: np.ndarray) 
     stacked[:b, p] = factor[:b, b]
     stacked[b:, :p] = np.eye(p)
     upper = retriangulate(stacked, overwrite=True)
-    inverse = np.asarray(scipy.linalg.solve_triangular(upper[:p, :p], np.eye(p)))
+    identity = np.eye(p)
+    inverse = np.asarray(scipy.linalg.solve_triangular(upper[:p, :p], identity))
     root = whitened @ inverse
     return root @ upper[:p, p], root @ root.T
 
@@ -418,7 +428,8 @@ def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start
         """Return the negative logarithm of evidence times prior, and its gradient."""
         root = unscaled * sizes.deviations(t)
         # Inverse of the root of the covariance of y.
-        inverse, _ = dtrtri(np.linalg.cholesky(root @ root.T + np.eye(b)), lower=1)
+        information = root @ root.T + np.eye(b)
+        inverse, _ = dtrtri(np.linalg.cholesky(information), lower=1)
         whitened_root = inverse @ root
         whitened = inverse @ target
         deviation = (t - sizes.centre) / sizes.width
@@ -427,13 +438,10 @@ def _most_probable(factor: np.ndarray, columns: np.ndarray, sizes: _Sizes, start
         evidence_slope = (whitened @ whitened_root) ** 2 - np.einsum("ij,ij->j", whitened_root, whitened_root)
         return value, deviation / sizes.width - np.bincount(sizes.member, evidence_slope, len(t))
 
+    bounds = np.column_stack([sizes.lower, sizes.upper])
+    clipped_start = np.clip(start, sizes.lower, sizes.upper)
     solution = scipy.optimize.minimize(
-        cost,
-        np.clip(start, sizes.lower, sizes.upper),
-        jac=True,
-        method="L-BFGS-B",
-        bounds=np.column_stack([sizes.lower, sizes.upper]),
-        options={"maxiter": 60, "ftol": 1e-8},
+        cost, clipped_start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60, "ftol": 1e-8}
     )
     return np.asarray(solution.x)
 
@@ -442,7 +450,8 @@ def rods(chain: Chain, model: IdentificationModel, total: float = 1.0) -> np.nda
     """Return parameters (B, 10) of rods from each body's frame to the next, mass by length and thickness."""
     bodies = model.bodies
     moves = bodies.coordinates >= 0
-    ends = np.array([np.asarray(chain.tail)[:3, 3]] * bodies.count)
+    tail_end = np.asarray(chain.tail)[:3, 3]
+    ends = np.array([tail_end] * bodies.count)
     for i, parent in enumerate(bodies.parents):
         if parent >= 0 and moves[i]:
             ends[parent] = bodies.placements[i][:3, 3]

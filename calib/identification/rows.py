@@ -98,15 +98,12 @@ def make_case(
     if motion.effort_variance is not None and rows.motors_alone:
         factor = 1.0 if gains is None else np.abs(gains)
         noise = frozen(np.sqrt(motion.effort_variance) * factor)
-    valid = np.repeat(motion.weight[:, None] > 0.5, motion.n, axis=1)
+    in_use = motion.weight[:, None] > 0.5
+    valid = np.repeat(in_use, motion.n, axis=1)
+    target = frozen(rows.target(effort, motion.tau_link, motion.q, motion.v))
+    present = frozen(rows.of_joints(valid), bool)
     return Case(
-        name=name,
-        motion=motion,
-        target=frozen(rows.target(effort, motion.tau_link, motion.q, motion.v)),
-        carried=tuple(carried),
-        present=frozen(rows.of_joints(valid), bool),
-        noise=noise,
-        torque_rows=rows,
+        name=name, motion=motion, target=target, carried=tuple(carried), present=present, noise=noise, torque_rows=rows
     )
 
 
@@ -193,7 +190,8 @@ class ObservationRows:
     @property
     def counted(self) -> np.ndarray:
         """How many rows each one counts as (M, rows), where residuals are averaged."""
-        return np.where(self.standing > 0.0, self._frictions * self.rest.count, 1.0) * self.present
+        counted = self._frictions * self.rest.count
+        return np.where(self.standing > 0.0, counted, 1.0) * self.present
 
     @property
     def _frictions(self) -> np.ndarray:
@@ -206,16 +204,23 @@ class ObservationRows:
         So that recordings are weighed separately, as joints are where a sample has a row for each.
         """
         filled = np.arange(count) == recording
+        matrix = np.where(filled[:, None], self.matrix, 0.0)
+        target = np.where(filled, self.target, 0.0)
+        present = self.present & filled
+        standing = np.repeat(self.standing, count, axis=1)
+        swing = np.repeat(self.swing, count, axis=1)
+        breakaway = np.repeat(self.breakaway, count, axis=1)
+        coulomb = np.repeat(self.coulomb, count, axis=0)
         return replace(
             self,
-            matrix=np.where(filled[:, None], self.matrix, 0.0),
-            target=np.where(filled, self.target, 0.0),
-            present=self.present & filled,
-            standing=np.repeat(self.standing, count, axis=1),
-            swing=np.repeat(self.swing, count, axis=1),
-            breakaway=np.repeat(self.breakaway, count, axis=1),
+            matrix=matrix,
+            target=target,
+            present=present,
+            standing=standing,
+            swing=swing,
+            breakaway=breakaway,
             rest=_no_rest(count),
-            coulomb=np.repeat(self.coulomb, count, axis=0),
+            coulomb=coulomb,
         )
 
     def extend(self, terms: Sequence[DriveTerm], columns: np.ndarray) -> ObservationRows:
@@ -230,12 +235,10 @@ class ObservationRows:
         columns = np.where(at_rest & undecided_at_rest, 0.0, columns)
         names = [term.name for term in terms]
         units = [term.unit for term in terms]
+        matrix = np.concatenate([self.matrix, columns], axis=2)
+        all_coulomb = np.hstack([self.coulomb, coulomb])
         return replace(
-            self,
-            coulomb=np.hstack([self.coulomb, coulomb]),
-            names=(*self.names, *names),
-            units=(*self.units, *units),
-            matrix=np.concatenate([self.matrix, columns], axis=2),
+            self, coulomb=all_coulomb, names=(*self.names, *names), units=(*self.units, *units), matrix=matrix
         )
 
 
@@ -257,7 +260,8 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
 
     # Transposed, because readers take the columns of one row.
     sample_count = len(kept(segment, decimator))
-    matrix = np.zeros((model.rows, len(columns), sample_count)).transpose(2, 0, 1)
+    storage = np.zeros((model.rows, len(columns), sample_count))
+    matrix = storage.transpose(2, 0, 1)
     states = segmented_states(model.columns, case)
     step = max(1, BLOCK // decimator.factor) * decimator.factor
     first = 0
@@ -282,19 +286,26 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
     target = decimate(case.target, decimator, segment)
     names = tuple(model.names[column] for column in columns)
     units = tuple(model.units[column] for column in columns)
+    present = thinned(case.present, segment, decimator)
+    rate = motion.rate / decimator.factor
+    standing = np.zeros(target.shape)
+    swing = np.zeros(target.shape)
+    breakaway = np.ones(target.shape)
+    coulomb = np.zeros((model.rows, len(columns)), dtype=bool)
+    block = np.zeros(len(target), dtype=int)
     return ObservationRows(
         names=names,
         units=units,
         matrix=matrix,
         target=target,
-        present=thinned(case.present, segment, decimator),
-        block=np.zeros(len(target), dtype=int),
-        rate=motion.rate / decimator.factor,
-        standing=np.zeros(target.shape),
-        swing=np.zeros(target.shape),
-        breakaway=np.ones(target.shape),
+        present=present,
+        block=block,
+        rate=rate,
+        standing=standing,
+        swing=swing,
+        breakaway=breakaway,
         rest=_no_rest(model.rows),
-        coulomb=np.zeros((model.rows, len(columns)), dtype=bool),
+        coulomb=coulomb,
     )
 
 
@@ -309,7 +320,10 @@ def _entry_blocks(
 
 def _no_rest(rows: int) -> RestWeights:
     """Return the weights of standstills before any estimate: each is a row."""
-    return RestWeights(np.ones(rows), np.ones(rows), np.full(rows, np.inf))
+    worth = np.ones(rows)
+    count = np.ones(rows)
+    reach = np.full(rows, np.inf)
+    return RestWeights(worth, count, reach)
 
 
 def observe_terms(
@@ -345,7 +359,9 @@ def term_columns(term: DriveTerm, case: Case, load: np.ndarray | None = None) ->
 def segmented_states(terms: Sequence[DriveTerm], case: Case) -> np.ndarray:
     """Return the states (s, N) of friction with hysteresis, zero at the start of each segment."""
     motion = case.motion
-    states = [drives.friction_states(terms, motion.q[start:stop].T) for start, stop in segments(motion.segment)]
+    states = []
+    for start, stop in segments(motion.segment):
+        states.append(drives.friction_states(terms, motion.q[start:stop].T))
     return np.concatenate(states, axis=1)
 
 
@@ -386,7 +402,8 @@ def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
     row_count = all_rows[0].target.shape[1]
     last_blocks = [int(rows.block.max(initial=-1)) for rows in all_rows]
     block_count = 1 + max(last_blocks, default=-1)
-    result = empty(all_rows[0].names, all_rows[0].units, (block_count + 1) * row_count)
+    groups = (block_count + 1) * row_count
+    result = empty(all_rows[0].names, all_rows[0].units, groups)
     counts = np.zeros(result.groups)
     for rows in all_rows:
         block = np.where(rows.block < 0, block_count, rows.block)
@@ -409,10 +426,12 @@ def pool(data: Triangles, rows: int, blocks: Sequence[int] | None = None) -> Tri
     if blocks is None:
         blocks = range(data.groups // rows)
     # Groups of each row (rows, blocks).
-    index = np.add.outer(np.arange(rows), rows * np.array(blocks, dtype=int))
+    first_rows = rows * np.array(blocks, dtype=int)
+    index = np.add.outer(np.arange(rows), first_rows)
     size = data.parameters + 1
     factors = [retriangulate(data.factors[groups].reshape(-1, size)) for groups in index]
-    return replace(data, factors=np.stack(factors), rows=data.rows[index].sum(axis=1))
+    counts = data.rows[index].sum(axis=1)
+    return replace(data, factors=np.stack(factors), rows=counts)
 
 
 def _regressor(model: RegressorModel, case: Case, part: slice, states: np.ndarray) -> np.ndarray:
@@ -421,7 +440,8 @@ def _regressor(model: RegressorModel, case: Case, part: slice, states: np.ndarra
     q = motion.q[part]
     v = motion.v[part]
     a = motion.a[part]
-    return model.regressor(q, v, a, None, case.carried, states[:, part], **case.deflected(part))
+    deflected = case.deflected(part)
+    return model.regressor(q, v, a, None, case.carried, states[:, part], **deflected)
 
 
 def power_block(
@@ -437,7 +457,9 @@ def power_block(
     motion = case.motion
     start = max(segment.start, part.start - DIFFERENCE_REACH)
     stop = min(segment.stop, part.stop + DIFFERENCE_REACH)
-    all_energies = model.energy_columns(motion.q[start:stop], motion.v[start:stop], case.carried)
+    q = motion.q[start:stop]
+    v = motion.v[start:stop]
+    all_energies = model.energy_columns(q, v, case.carried)
     energies = all_energies[:, columns]
     power = slope(energies, motion.rate)
     plain_power = np.zeros_like(energies)
@@ -448,7 +470,8 @@ def power_block(
 
     q = motion.q[part]
     v = motion.v[part]
-    regressor = model.regressor(q, v, np.zeros_like(v), None, case.carried, states[:, part])
+    no_acceleration = np.zeros_like(v)
+    regressor = model.regressor(q, v, no_acceleration, None, case.carried, states[:, part])
     losses = regressor.transpose(2, 1, 0)[columns, 0]
     stores_energy = []
     for column in columns:

@@ -130,7 +130,8 @@ def make_model(chain: Chain, settings: IdentificationSettings) -> Identification
     require(not (settings.passive or settings.identical_legs), "passive, identical_legs: arms have no legs", UsageError)
     _check_joints(chain.n, settings)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
-    sets = per_joint(settings.sets or (settings.torque_rows.drives,), chain.n, "drives")
+    values = settings.sets or (settings.torque_rows.drives,)
+    sets = per_joint(values, chain.n, "drives")
     v0 = per_joint(settings.v0, chain.n, "v0")
     terms = list(drives.standard(sets, v0, linear))
     for coupling in settings.couplings:
@@ -149,7 +150,8 @@ def make_model(chain: Chain, settings: IdentificationSettings) -> Identification
             first_row, _ = term.acts[0]
             term = replace(term, linear=linear[first_row])
         terms.append(term)
-    return IdentificationModel(make_bodies(chain, settings), tuple(terms), settings.torque_rows)
+    bodies = make_bodies(chain, settings)
+    return IdentificationModel(bodies, tuple(terms), settings.torque_rows)
 
 
 def make_bodies(chain: Chain, settings: IdentificationSettings) -> Bodies:
@@ -158,7 +160,9 @@ def make_bodies(chain: Chain, settings: IdentificationSettings) -> Bodies:
     if settings.gravity is not None:
         bodies = bodies.with_gravity(np.array(settings.gravity))
     for label in settings.payloads:
-        bodies = with_payload(bodies, np.asarray(chain.tail), label, on=chain.n - 1)
+        on = chain.n - 1
+        placement = np.asarray(chain.tail)
+        bodies = with_payload(bodies, placement, label, on=on)
     return bodies
 
 

@@ -99,9 +99,11 @@ def with_standstills(
     held = coulomb.any(axis=1)
     masks = []
     for part, case in zip(all_rows, cases):
-        stands = thinned(model.torque_rows.of_joints(standing_joints(case, v0)), case.motion.segment, decimator)
+        standing = model.torque_rows.of_joints(standing_joints(case, v0))
+        stands = thinned(standing, case.motion.segment, decimator)
         masks.append(stands & part.present & held)
-    moving = np.sum([(part.present & ~mask).sum(axis=0) for part, mask in zip(all_rows, masks)], axis=0)
+    counts = [(part.present & ~mask).sum(axis=0) for part, mask in zip(all_rows, masks)]
+    moving = np.sum(counts, axis=0)
     result = []
     for part, case, mask in zip(all_rows, cases, masks):
         segment = case.motion.segment[kept(case.motion.segment, decimator)]
@@ -137,7 +139,8 @@ def _acted(acts: Sequence[tuple[int, object]], torque_rows: TorqueRows, side: st
 
 def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
     """Return (start, stop) of each run of true values."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(int), [0]])))
+    padded = np.concatenate([[0], mask.astype(int), [0]])
+    edges = np.flatnonzero(np.diff(padded))
     return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
 
 
@@ -196,19 +199,22 @@ class DividedRows:
         reach = np.maximum(2.0 * np.sqrt(3.0 * (noise + spread)), 1e-300)
         values_of_friction = 1.0 + self.swing / reach
         variance = np.maximum(noise * values_of_friction / self.length + spread, 1e-300)
-        return RestWeights(frozen(noise / variance), frozen(tau * (std**2 + spread) / variance), frozen(reach))
+        worth = frozen(noise / variance)
+        return RestWeights(worth, frozen(tau * (std**2 + spread) / variance), frozen(reach))
 
     def joined(self, weights: RestWeights) -> Triangles:
         """Return the R factors of all rows, standstills with these weights."""
         if not self.standstills.any():
             return self.moving
         scaled = self.standing.factors * np.sqrt(weights.worth)[:, None, None]
-        renewed = self.swinging.factors * np.sqrt(weights.worth / weights.reach)[:, None, None]
+        scale = np.sqrt(weights.worth / weights.reach)
+        renewed = self.swinging.factors * scale[:, None, None]
         both = np.concatenate([self.moving.factors, scaled, renewed], axis=1)
         frictions = self.standstills * (1.0 + self.swing / weights.reach)
         counted = np.round(frictions * weights.count)
         factors = frozen(np.stack([retriangulate(stacked) for stacked in both]))
-        return replace(self.moving, factors=factors, rows=frozen(self.moving.rows + counted, int))
+        rows = frozen(self.moving.rows + counted, int)
+        return replace(self.moving, factors=factors, rows=rows)
 
 
 def divided(all_rows: Sequence[ObservationRows]) -> DividedRows:
@@ -295,7 +301,7 @@ def _travel_since_standstill(
     position = torque_rows.of_joints(case.motion.q)[index]
     result = np.full(part.target.shape, np.inf)
     for start, stop in segments(segment):
-        for row in range(result.shape[1]):
+        for row in range(part.standing.shape[1]):
             runs = _runs(part.standing[start:stop, row] > 0.0)
             starts = [start + first for first, _ in runs[1:]]
             for (_, end), following in zip(runs, [*starts, stop]):

@@ -67,8 +67,10 @@ def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimato
         v = _signed_norm(v)
         a = _signed_norm(a)
     low, high = np.quantile(q, [END_SHARE, 1.0 - END_SHARE], axis=0)
-    fastest = np.abs(v) > np.quantile(np.abs(v), 1.0 - FAST_SHARE, axis=0)
-    hardest = np.abs(a) > np.quantile(np.abs(a), 1.0 - FAST_SHARE, axis=0)
+    speed_limit = np.quantile(np.abs(v), 1.0 - FAST_SHARE, axis=0)
+    fastest = np.abs(v) > speed_limit
+    acceleration_limit = np.quantile(np.abs(a), 1.0 - FAST_SHARE, axis=0)
+    hardest = np.abs(a) > acceleration_limit
     ranges = [fastest, hardest, q < low, q > high, v > 0.0, v < 0.0]
     in_range = np.stack(ranges)[:, :, joint]
 
@@ -79,7 +81,8 @@ def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimato
     total_counts = np.zeros(row_count)
     start = 0
     for rows in all_rows:
-        augmented = np.concatenate([rows.matrix, rows.target[:, :, None]], axis=2)
+        target = rows.target[:, :, None]
+        augmented = np.concatenate([rows.matrix, target], axis=2)
         augmented = augmented * rows.weight[:, :, None]
         part = slice(start, start + len(augmented))
         start += len(augmented)
@@ -99,7 +102,8 @@ def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimato
 
 def _signed_norm(rates: np.ndarray) -> np.ndarray:
     """Return the norm of all joints' rates (N, n), each in units of its spread, with the signs of each (N, n)."""
-    norm = np.linalg.norm(rates / (np.std(rates, axis=0) + 1e-12), axis=1)
+    normalised = rates / (np.std(rates, axis=0) + 1e-12)
+    norm = np.linalg.norm(normalised, axis=1)
     return np.copysign(norm[:, None], rates)
 
 
@@ -153,7 +157,8 @@ class CrossValidation:
         index = np.append(columns, self.data.parameters)
         weight = 1.0 / (self.std**2 * self.inflation)
         prior_square = self._prior_square(index)
-        rounding = 1e-9 * (weight @ self.regimes.total_squares.diagonal(axis1=1, axis2=2))[index]
+        diagonals = self.regimes.total_squares.diagonal(axis1=1, axis2=2)
+        rounding = 1e-9 * (weight @ diagonals)[index]
         result = np.zeros((len(self.regimes.squares), self.rows))
         for k, (held_out, counts) in enumerate(zip(self.regimes.squares, self.regimes.counts)):
             training = np.tensordot(weight, self.regimes.total_squares - held_out, 1)
@@ -203,8 +208,10 @@ class CrossValidation:
         """Products [W y]ᵀ[W y] of the whitened rows of each block (blocks, p + 1, p + 1)."""
         factors = self.data.factors[: self.blocks * self.rows]
         weight = np.tile(1.0 / (self.std**2 * self.inflation), self.blocks)
-        squares = (factors.transpose(0, 2, 1) * weight[:, None, None]) @ factors
-        return squares.reshape(self.blocks, self.rows, *squares.shape[1:]).sum(axis=1)
+        weighted = factors.transpose(0, 2, 1) * weight[:, None, None]
+        squares = weighted @ factors
+        by_block = squares.reshape(self.blocks, self.rows, *squares.shape[1:])
+        return by_block.sum(axis=1)
 
 
 def estimate(
@@ -216,13 +223,15 @@ def estimate(
     with none, this is weighted least squares. Directions without any data stay where they are: at zero.
     """
     weight = 1.0 / (std * np.sqrt(inflation))
-    whitened = (data.factors * weight[:, None, None]).reshape(-1, data.parameters + 1)
+    weighted = data.factors * weight[:, None, None]
+    whitened = weighted.reshape(-1, data.parameters + 1)
     if prior is not None:
         whitened = np.vstack([whitened, prior])
     if (group < 0).all():
         size = np.sqrt(np.sum(whitened[:, :-1] ** 2, axis=0))
         scale = np.where(size > 0.0, size, 1.0)
-        scaled_values, *_ = np.linalg.lstsq(whitened[:, :-1] / scale, whitened[:, -1], rcond=1e-10)
+        scaled_matrix = whitened[:, :-1] / scale
+        scaled_values, *_ = np.linalg.lstsq(scaled_matrix, whitened[:, -1], rcond=1e-10)
         return scaled_values / scale, np.full(len(group), np.inf)
     row_count = int(np.sum(data.rows / inflation))
     return _regularised(whitened.T @ whitened, row_count, group, _kinds(group, data.units))
@@ -246,12 +255,15 @@ def _regularised(square: np.ndarray, rows: int, group: np.ndarray, kinds: np.nda
     largest = np.zeros(kinds.max(initial=-1) + 2)
     np.maximum.at(largest, kinds, size)
     size = np.where(group < 0, size, np.maximum(size, largest[kinds] / MAX_DEVIATION_RATIO))
-    scale = np.where(size > 0.0, size, 1.0) / np.sqrt(max(rows, 1))
+    safe_size = np.where(size > 0.0, size, 1.0)
+    scale = safe_size / np.sqrt(max(rows, 1))
     scaled = square[:-1, :-1] / (scale[:, None] * scale)
     # Free columns without data stay at zero.
     scaled[np.diag_indices(len(group))] += np.where(group < 0, 1e-9 * rows, 0.0)
     cross = square[:-1, -1] / scale
-    data = Gram(scaled, cross, float(square[-1, -1]), rows)
-    fit = relevance(data, group, np.ones(len(group)), RELEVANCE_ITERATIONS)
+    total = float(square[-1, -1])
+    data = Gram(scaled, cross, total, rows)
+    start = np.ones(len(group))
+    fit = relevance(data, group, start, RELEVANCE_ITERATIONS)
     ridge = np.where(np.isfinite(fit.ridge), fit.ridge / scale, np.inf)
     return fit.values / scale, ridge

@@ -21,7 +21,7 @@ of a serial arm; payloads are not part of the robot.
 """
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import import_module
@@ -59,9 +59,9 @@ from calib.parallel.mechanism.velocities import LoopMotion, of_platform
 from calib.parallel.robots import ParallelMechanism
 from calib.procedure.export.delivery import DRIVES, MJCF, README, TO_SIMULATE, write_drives
 from calib.procedure.export.identified import Drives, drive_table
-from calib.procedure.findings import LEVELS
+from calib.procedure.findings import NOT_JUDGED
 from calib.procedure.kinematic_stage.folder import URDF
-from calib.result_kinds import refusal
+from calib.results.registry import open_result
 from calib.robot.calibrated import ROBOT
 from calib.robot.chain import Chain, Element, Joint
 from calib.robot.formats.native import NativeModel
@@ -396,16 +396,21 @@ def export_parallel(robot: ParallelMechanism, folder: Path, into: Path, prior: s
     Raises:
         RobotError: where Pinocchio reads other loops or other forces; nothing is written.
     """
-    if not any((folder / name).is_file() for name in (MODEL, ESTIMATE)):
-        raise UsageError(refusal(folder, "export"))
+    result = open_result(folder, "export")
+    if result.identification is None and not (folder / ESTIMATE).is_file():
+        result.refuse("export")
     check_export_target(
         into, [robot.source, *(folder / name for name in (ROBOT, METRICS, MODEL, ESTIMATE, COVARIANCE))]
     )
-    if (folder / MODEL).is_file():
+    if result.identification is not None:
         source = _identified(robot, folder, prior)
     else:
         source = _calibrated(robot, folder)
-    opened, (level, verdict) = source.opened, _verdict(folder)
+    opened = source.opened
+    level = result.verdict.level
+    verdict = "" if level == NOT_JUDGED else str(result.verdict)
+    if level == "fail":
+        verdict += "; do not use"
     remark = verdict if level in ("marginal", "fail") else ""
     texts = {URDF: opened.urdf(), MJCF: opened.mjcf()}
     for name, text in texts.items():
@@ -437,24 +442,6 @@ def check_export_target(out: Path, inputs: Iterable[str | Path | None] = ()) -> 
 
 def _uses() -> Iterator[str]:
     return (f"{name}: {use}" for name, use in USES.items() if use)
-
-
-def _verdict(folder: Path) -> tuple[str, str]:
-    """Return the verdict on a fit or an identification: its level, and a sentence; both empty where none is known."""
-    if (folder / METRICS).is_file():
-        table = json.loads((folder / METRICS).read_text(encoding="utf-8"))
-    else:
-        table = {}
-    verdict = table.get("verdict", "")
-    if isinstance(verdict, Mapping):
-        level = verdict["level"]
-        reason = verdict["reason"]
-    else:
-        level = verdict
-        reason = table.get("reason", "")
-    if level not in LEVELS:
-        return "", ""
-    return level, f"verdict {level}: {reason}" + ("; do not use" if level == "fail" else "")
 
 
 def _check(opened: OpenedRobot, text: str, where: str, postures: int = 5) -> None:

@@ -189,19 +189,35 @@ def sentence(finding: Finding) -> str:
     return _filled(catalogue()[finding.code].says, finding.values)
 
 
-class Warned(str):
-    """Text of a finding that prevents the verdict pass; commands always print it."""
+@dataclass(frozen=True)
+class Note:
+    """A line for the user; a warning is of a finding that prevents the verdict pass, and commands always print it."""
+
+    text: str
+    is_warning: bool = False
+
+    def __str__(self) -> str:
+        return self.text
+
+
+def notes_of(findings: Iterable[Finding]) -> list[Note]:
+    """Return one note for each finding: its sentence, its advice, and how to accept it."""
+    notes = []
+    for finding in findings:
+        line = _line(finding, catalogue()[finding.code])
+        notes.append(Note(line, level_of(finding) in LEVELS))
+    return notes
 
 
 def lines_of(findings: Iterable[Finding]) -> list[str]:
-    """Return one line for each finding: its sentence, its advice, and how to accept it."""
-    lines = []
-    for finding in findings:
-        line = _line(finding, catalogue()[finding.code])
-        if level_of(finding) in LEVELS:
-            line = Warned(line)
-        lines.append(line)
-    return lines
+    """Return the text of the notes of findings."""
+    return [note.text for note in notes_of(findings)]
+
+
+def as_notes(lines: Iterable[str], findings: Iterable[Finding]) -> list[Note]:
+    """Return lines as notes; those of the findings that prevent the verdict pass are warnings."""
+    warnings = {note.text for note in notes_of(findings) if note.is_warning}
+    return [Note(line, line in warnings) for line in lines]
 
 
 def _line(finding: Finding, entry: CatalogueEntry) -> str:

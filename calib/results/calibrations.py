@@ -32,6 +32,9 @@ class CalibratedRobot(Viewed):
 
     kind = BY_NAME["robot"]
 
+    def check_arm(self, verb: str) -> None:
+        stage_of(self.path, verb)
+
     def export(self, into: Path, settings: ExportSettings) -> Exported:
         """Write the robot for other programs: all files into a folder, or a ROS 2 package below it."""
         stage = stage_of(self.path, "export")
@@ -90,8 +93,8 @@ class StoredFit(CalibratedRobot):
             return Verdicts({"geometry": super().verdict})
         return delivery.fit_verdicts(self.path)
 
-    def fit(self, verb: str) -> FitFolder:
-        stage_of(self.path, verb)
+    @property
+    def fit(self) -> FitFolder:
         return FitFolder(self.path)
 
     def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
@@ -160,7 +163,8 @@ class StoredSession(Viewed):
     def verdicts(self) -> Verdicts:
         return self.session.verdicts() if self.finished else Verdicts()
 
-    def fit(self, verb: str) -> FitFolder | None:
+    @property
+    def fit(self) -> FitFolder | None:
         folder = self.session.fit
         complete = folder.numbers.exists() and (folder.path / COVARIANCE).exists()
         return folder if self.session.geometric and complete else None
@@ -174,9 +178,11 @@ class StoredSession(Viewed):
     def figures(self) -> dict[str, Picture]:
         """Return the figures of the steps by name, as ``4-fit/map``."""
         result = {}
-        for name, folder in (("fit", self.fit("view")), ("dynamics", self.identification)):
-            if folder is not None:
-                result |= {f"{name}/{key}": value for key, value in StoredResult(folder.path).figures().items()}
+        for folder in (self.fit, self.identification):
+            if folder is None:
+                continue
+            for name, picture in StoredResult(folder.path).figures().items():
+                result[f"{folder.path.name}/{name}"] = picture
         return result
 
     def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:

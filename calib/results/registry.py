@@ -91,9 +91,9 @@ class StoredSelection(StoredFile):
 
     def scene(self, robot: str | None = None) -> Scene:
         """Return the poses, of a robot that has to be named."""
-        from calib.results import scene
+        from calib.results import scene_files
 
-        return scene.read(self.path, robot)
+        return scene_files.read(self.path, robot)
 
 
 class StoredRecall(StoredFile):
@@ -193,6 +193,6 @@ def drawn(path: str | Path, robot: str | None = None) -> Scene:
     """
     if kind_of(path) is not None:
         return open_result(path, "view").scene(robot)
-    from calib.results import scene
+    from calib.results import scene_files
 
-    return scene.read(path, robot)
+    return scene_files.read(path, robot)

@@ -133,13 +133,13 @@ class StoredResult:
         """Folder of the identified dynamics; None without."""
         return None
 
-    def fit(self, verb: str) -> FitFolder | None:
-        """Return the folder of the fitted geometry; None without.
-
-        Raises:
-            UsageError: where the robot is of a kind that the verb does not take.
-        """
+    @property
+    def fit(self) -> FitFolder | None:
+        """Folder of the fitted geometry; None without."""
         return None
+
+    def check_arm(self, verb: str) -> None:
+        """Refuse a robot of another kind than a serial arm, of which the verb does not take results."""
 
     def motion(self) -> Path:
         """Refuse: there is no motion to play."""
@@ -218,6 +218,6 @@ class Viewed(StoredResult):
 
     def scene(self, robot: str | None = None) -> Scene:
         """Return what the viewer draws."""
-        from calib.results import scene
+        from calib.results import scene_files
 
-        return scene.read(self.path, robot)
+        return scene_files.read(self.path, robot)

@@ -1,9 +1,28 @@
-"""Recordings: joint positions and torques over time, and the motions filtered from them."""
+"""Recordings: joint positions and torques over time, the motions filtered from them, planned motions."""
 
 from calib.data.recordings.recording import Recording
 from calib.data.signals.bandwidth import USABLE
 from calib.data.signals.filtering import design_decimator
 from calib.data.signals.motion import FilterOptions, make_motion
 from calib.data.signals.resampling import GAP
+from calib.procedure.excitation.coefficients import ARM as ARM_FILE
+from calib.procedure.excitation.coefficients import NAME as TRAJECTORY_FILE
+from calib.procedure.excitation.coefficients import PLANNED as PLANNED_FILE
+from calib.procedure.excitation.coefficients import RUN as RUN_FILE
+from calib.procedure.excitation.coefficients import SAMPLES as SAMPLES_FILE
+from calib.procedure.excitation.coefficients import read as read_trajectory
 
-__all__ = ["GAP", "USABLE", "FilterOptions", "Recording", "design_decimator", "make_motion"]
+__all__ = [
+    "ARM_FILE",
+    "GAP",
+    "PLANNED_FILE",
+    "RUN_FILE",
+    "SAMPLES_FILE",
+    "TRAJECTORY_FILE",
+    "USABLE",
+    "FilterOptions",
+    "Recording",
+    "design_decimator",
+    "make_motion",
+    "read_trajectory",
+]

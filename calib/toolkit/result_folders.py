@@ -2,46 +2,61 @@
 
 from calib.api.dynamic import DynamicsModel
 from calib.api.kinematic import GeometryFit
-from calib.api.rendering import ChartedResult, Judged, saved
+from calib.api.rendering import ChartedResult, Judged, Unjudged, saved
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.metrics import UnseenReport
 from calib.procedure.export.delivery import fit_verdicts, prediction
 from calib.procedure.export.geometry import read as read_exported
 from calib.procedure.export.geometry import results as geometry_results
-from calib.procedure.findings import LEVELS, Verdict, limit, lines_of, sentence, settle
+from calib.procedure.findings import LEVELS, Verdict, limit, lines_of, notes_of, sentence, settle
 from calib.procedure.kinematic_stage.folder import IN_SESSION, URDF, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.procedure.kinematic_stage.inputs import read_file as read_measured_file
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics, ValidationMetrics
-from calib.procedure.kinematic_stage.settings import FitSettings, Tolerance
+from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.tables import read_covariance
 from calib.procedure.robot_kinds import joints_of, stage_of
+from calib.results.registry import drawn, open_result
+from calib.results.result import Result, StoredResult
+from calib.results.scene import ChartedResult as DrawnRobot
+from calib.results.scene import ErrorSizes, Measured, Played, Scene, Torques, skeleton, strips, thinned
 
 __all__ = [
     "IN_SESSION",
     "LEVELS",
     "URDF",
     "VALIDATED",
-    "ComparedRows",
     "ChartedResult",
+    "ComparedRows",
+    "DrawnRobot",
     "DynamicsModel",
+    "ErrorSizes",
     "FitFolder",
     "FitMetrics",
     "FitSettings",
     "GeometryFit",
     "IdentificationFolder",
     "Judged",
-    "Tolerance",
+    "Measured",
+    "Played",
+    "Result",
+    "Scene",
+    "StoredResult",
+    "Torques",
+    "Unjudged",
     "UnseenReport",
     "ValidationFolder",
     "ValidationMetrics",
     "Verdict",
+    "drawn",
     "fit_verdicts",
     "geometry_results",
     "joints_of",
     "limit",
     "lines_of",
     "load_robot",
+    "notes_of",
+    "open_result",
     "prediction",
     "read_covariance",
     "read_exported",
@@ -49,5 +64,8 @@ __all__ = [
     "saved",
     "sentence",
     "settle",
+    "skeleton",
     "stage_of",
+    "strips",
+    "thinned",
 ]

@@ -14,7 +14,8 @@ import numpy as np
 from calib.identification.identify import identify
 from calib.identification.identify_options import parse_options
 from calib.identification.prediction import predict, score
-from calib.identification.uncertainty.torque_errors import intervals, learn_torque_errors
+from calib.identification.uncertainty.learned_torque_errors import learn_torque_errors
+from calib.identification.uncertainty.torque_errors import intervals
 from calib.procedure.dynamic_stage.inputs import gather
 
 DATA = Path(os.environ.get("CALIB_DATA", "../shared/data"))

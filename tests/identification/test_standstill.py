@@ -24,7 +24,8 @@ from calib.identification.standstill import (
     with_standstills,
     with_weights,
 )
-from calib.identification.uncertainty.torque_errors import intervals, learn_torque_errors
+from calib.identification.uncertainty.learned_torque_errors import learn_torque_errors
+from calib.identification.uncertainty.torque_errors import intervals
 
 PLAIN = IdentificationSettings(friction="standard", essential="none")
 WIDTH = np.full(planted.N, 0.01)  # of Coulomb's sign [rad/s]

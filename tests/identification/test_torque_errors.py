@@ -10,11 +10,11 @@ from calib.identification.identify import Identification, identify
 from calib.identification.prediction import predict
 from calib.identification.rows import Case
 from calib.identification.settings import IdentificationSettings
+from calib.identification.uncertainty.learned_torque_errors import learn_torque_errors
 from calib.identification.uncertainty.torque_errors import (
     TorqueErrorModel,
     TorqueIntervals,
     intervals,
-    learn_torque_errors,
     parameter_variances,
 )
 from calib.records import frozen

@@ -12,7 +12,7 @@ from calib.parallel.mechanism.closure import closed
 from calib.parallel.mechanism.geometric_fit import changed, loop_parameters
 from calib.parallel.robots import find
 from calib.parallel.view import picture
-from calib.results import scene as viewing
+from calib.results import scene_files as viewing
 
 
 def recorded(path: Path) -> dict[str, list]:

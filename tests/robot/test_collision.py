@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import RobotError
 from calib.robot import capsules, collision
-from calib.robot.capsules import Obstacle, Wall
 from calib.robot.chain import random_joints
 from calib.robot.kinematics import joint_jacobian, sweep
 from calib.robot.library import load
+from calib.robot.obstacles import Obstacle, Wall
 from calib.transforms import pose
 
 

@@ -7,7 +7,7 @@ import typer
 
 from calib.cli.completion import robots
 from calib.cli.shared import Seed, command, exit_failed, reporting
-from calib.errors import UsageError, require
+from calib.errors import UsageError
 
 app = typer.Typer()
 
@@ -45,10 +45,13 @@ def demo(
         if bring is not None:
             demonstration.simulate_next(bring, say)
             return
-        require(not (hard and robot), f"--robot {robot}: --hard names a robot, too; leave one out", UsageError)
+        if hard and robot:
+            raise UsageError(f"--robot {robot}: --hard names a robot, too; leave one out")
+        if hard:
+            robot = demonstration.HARD
         result = demonstration.run(
             out,
-            robot or (demonstration.HARD if hard else demonstration.ROBOT),
+            robot or demonstration.ROBOT,
             seed,
             say,
             progress,
@@ -61,5 +64,6 @@ def demo(
     if result.asks:
         say("", *result.asks)
         return
-    say(demonstration.row("time", result.seconds, "s"), *reasons(result.session), "", *paths(result.session))
+    say(demonstration.row("time", result.seconds, "s"), *reasons(result.session))
+    say("", *paths(result.session))
     exit_failed(result.verdict)

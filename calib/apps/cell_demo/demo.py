@@ -6,13 +6,14 @@ import time
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from calib import files
 from calib.apps.cell_demo.summary import Telling, row
 from calib.data.poses import IMAGES
-from calib.errors import SessionError, UsageError, command_line, require
+from calib.errors import SessionError, UsageError, command_line
 from calib.folders import read_estimate
 from calib.geometry import installation
 from calib.identification.model_file import read_dynamics
@@ -29,12 +30,20 @@ from calib.simulation.truth import TRUTH, position_errors, share_within, torque_
 from calib.simulation.virtual_arm import REST, MovingArm, moving_arm, play, record, sensed
 from calib.simulation.virtual_cells import virtual_cell
 
-FIT, VALIDATION, AGAIN = 40, 20, 3
-DRIFT = 10e-6  # how far the simulated instrument wanders over a series [m]
-ROBOT, HARD = "tx40", "lwr4plus"  # by default; where effects that no model holds are as large as those that some do
-MOTION = {"period": 10.0, "rate": 500.0, "starts": 1, "evaluations": 150, "repeats": 2}  # little effort, for time
+# numbers of poses: of the fit, of the validation, and of those that are measured again
+FIT, VALIDATION, REPEATED = 40, 20, 3
+# how far the simulated instrument wanders over a series [m]
+DRIFT = 10e-6
+# by default; where effects that no model holds are as large as those that some do
+ROBOT, HARD = "tx40", "lwr4plus"
+# little effort, for time
+MOTION = {"period": 10.0, "rate": 500.0, "starts": 1, "evaluations": 150, "repeats": 2}
 SIMULATED = "simulated cell: {note}; nothing was measured on a robot"
-LOGS = (("training", 2, 240.0), ("validation", 3, 480.0))  # numbers of their noise, how long the arm ran before [s]
+TRAINING = "training"
+# seeds of their noise, how long the arm ran before [s]
+LOGS = ((TRAINING, 2, 240.0), ("validation", 3, 480.0))
+# how long the arm ran before the logs of further rounds [s]
+ROUND_RUNNING = 720.0
 
 
 @dataclass(frozen=True)
@@ -72,10 +81,10 @@ def run(
     """Return the result of a session on a simulated robot, compared with its hidden truth.
 
     Args:
-        folder: new; the session.
+        folder: of the session, to be created.
         robot: of the library.
         seed: of the robot's errors, the noise, the pose selection and the motions.
-        say, progress: lines that stay, and words that pass.
+        say, progress: print a permanent line, and show a transient status.
         dynamics: identify them, too, where the library knows the robot's masses.
         guided: stop where an engineer would; `simulate_next` then plays his part.
         plots: whether figures are drawn.
@@ -90,7 +99,10 @@ def run(
         supported = ", ".join(name for name in library.names() if load(name).inertias is not None)
         say(f"geometry only: masses are known of {supported}")
         dynamics = False
-    motion = MOTION | {"torques": "both" if sensed(robot) else "motor"} if dynamics else {}
+    motion: dict[str, Any] = {}
+    if dynamics:
+        torques = "both" if sensed(robot) else "motor"
+        motion = MOTION | {"torques": torques}
     begin = partial(
         new_session, folder, robot, instrument, poses=FIT, validation=VALIDATION, seed=seed, dynamics=dynamics, **motion
     )
@@ -101,6 +113,7 @@ def run(
             begin(limits=limits)
     else:
         begin()
+
     session = open_session(folder, plots)
     teller = Telling(session, say, progress, verbose)
     teller.said(f"the cell: {cell.note}")
@@ -110,49 +123,56 @@ def run(
             _bring_for(session, waiting.step.name, teller.said, teller.progress)
             waiting = steps.run_next(session, teller.said, teller.progress, "calib demo")
     if waiting is not None:
-        require(guided, f"the demonstration stopped at {waiting.step.name}: {waiting.words}", SessionError)
+        if not guided:
+            raise SessionError(f"the demonstration stopped at {waiting.step.name}: {waiting.words}")
         return DemoResult(session, "", time.perf_counter() - started, _stopped(session, waiting))
+
     before, after = _compare_with_truth(session, cell, say)
     if plots:
         from calib.apps.cell_demo.picture import draw
 
         draw(session)
-    unit = 2.0**20 if sys.platform == "darwin" else 2.0**10  # the system counts in bytes on macOS, in kB on Linux
+    # the system counts in bytes on macOS, in kB on Linux
+    unit = 2.0**20 if sys.platform == "darwin" else 2.0**10
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
-    return DemoResult(session, session.verdicts().level, time.perf_counter() - started, (), before, after, memory)
+    seconds = time.perf_counter() - started
+    verdict = session.verdicts().level
+    return DemoResult(session, verdict, seconds, (), before, after, memory)
 
 
 def _stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
     """Return the engineer's instructions, and the command that simulates them."""
     folder = session.folder
-    return (
-        *asks(session, waiting),
-        f"(or simulate this step: {command_line('demo', '--bring', folder)}; then: {command_line('next', folder)})",
-    )
+    simulate, go_on = command_line("demo", "--bring", folder), command_line("next", folder)
+    return *asks(session, waiting), f"(or simulate this step: {simulate}; then: {go_on})"
 
 
 def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
     """Return the tool errors [mm] of nominal and calibrated arm against the truth; say and write all errors."""
     cell_fit = installation.read(session.fit.path)
-    before, after, bare = position_errors(cell, cell_fit, calibrated.read(session.fit.path).chain)
+    urdf = calibrated.read(session.fit.path).chain
+    before, after, bare = position_errors(cell, cell_fit, urdf)
+    truth: dict[str, object] = {"position_mm": {"nominal": before, "calibrated": after, "urdf_alone": bare}}
+    notes = [cell.note, f"errors over {TRUTH} poses of the whole joint range, rms"]
     lines = [
         row("truth", before, "mm true error of the nominal robot"),
         row("truth", bare, "mm true error of robot.urdf"),
     ]
-    truth: dict[str, object] = {"position_mm": {"nominal": before, "calibrated": after, "urdf_alone": bare}}
-    notes = [cell.note, f"errors over {TRUTH} poses of the whole joint range, rms"]
     if session.dynamic:
         arm = arm_of(session, cell)
         chain, dynamics = read_dynamics(session.identification.path)
         torques = torque_errors(cell, arm, dynamics.model, dynamics.values, chain)
-        motion = dynamics_steps.designed_motions(session)[LOGS[0][0]]
-        middle = LOGS[0][2] + REST + motion.period * motion.repeat / 2.0
-        true = true_base(dynamics.model, cell, arm, session.settings.seed, middle)
+        # friction in the middle of the motion that was fitted
+        motion = dynamics_steps.designed_motions(session)[TRAINING]
+        running = LOGS[0][2] + REST + motion.period * motion.repeat / 2.0
+        true = true_base(dynamics.model, cell, arm, session.settings.seed, running)
         within, count = share_within(true, read_estimate(session.identification.path))
+        truth["torque_percent"] = torques.identified
+        truth["within_two_sigma"] = within
+        truth["base_parameters"] = count
         notes.append(arm.note)
-        truth |= {"torque_percent": torques.identified, "within_two_sigma": within, "base_parameters": count}
-        lines += [row("truth", torques.identified, "% true torque error on a random motion")]
-        lines += [row("truth", 100.0 * within, "% of parameters are within two sigma")]
+        lines.append(row("truth", torques.identified, "% true torque error on a random motion"))
+        lines.append(row("truth", 100.0 * within, "% of parameters are within two sigma"))
     files.write(session.path("truth.txt"), "\n".join([*notes, *lines]) + "\n")
     files.write_json(session.path("truth.json"), truth)
     for line in lines:
@@ -167,22 +187,33 @@ def simulate_next(folder: Path, say: Say) -> None:
         UsageError: where nothing is waited for, or the session's robot is none of the library.
     """
     session = open_session(folder)
-    if session.settings.robot.given not in library.names():
-        raise UsageError(
-            f"{folder} is about {session.settings.robot.given}; the simulated cells are of {', '.join(library.names())}"
-        )
+    robot = session.settings.robot.given
+    if robot not in library.names():
+        raise UsageError(f"{folder} is about {robot}; the simulated cells are of {', '.join(library.names())}")
     with locked(session, say):
-        waiting = next((state for state in steps.states(session) if state.kind not in (steps.DONE, steps.KEPT)), None)
-        step = "" if waiting is None else waiting.step.name
-        if waiting is None and next_round(session) in dynamics_steps.designed_motions(session):
-            step = "record"
-        elif waiting is None:
-            _compare_with_truth(session, _cells_of(session)[0], say)
+        step = _step_to_simulate(session)
+        if not step:
+            cell, _ = _cells_of(session)
+            _compare_with_truth(session, cell, say)
             return
-        elif waiting.kind != steps.WAITING:
-            raise UsageError(f"{folder} waits for no files; next: {command_line('next', folder)}")
         _bring_for(session, step, say)
     say(f"next: {command_line('next', folder)}")
+
+
+def _step_to_simulate(session: Session) -> str:
+    """Return the name of the step that waits for files; empty for a finished session.
+
+    Raises:
+        UsageError: where a step waits for something else.
+    """
+    for state in steps.states(session):
+        if state.kind == steps.WAITING:
+            return state.step.name
+        if state.kind not in (steps.DONE, steps.KEPT):
+            raise UsageError(f"{session.folder} waits for no files; next: {command_line('next', session.folder)}")
+    if next_round(session) in dynamics_steps.designed_motions(session):
+        return "record"
+    return ""
 
 
 def _cells_of(session: Session) -> tuple[Cell, CameraCell | None]:
@@ -196,11 +227,13 @@ def _cells_of(session: Session) -> tuple[Cell, CameraCell | None]:
 
 def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda text: None) -> None:
     """Simulate the files that a step waits for."""
-    seed, (cell, camera_cell) = session.settings.seed, _cells_of(session)
+    seed = session.settings.seed
+    cell, camera_cell = _cells_of(session)
     if step in ("measure", "validate") and camera_cell is not None:
         _mark(session, camera_cell.cell.note)
         for number, name, q in planned_poses(session.folder, cell.nominal):
-            take_pictures(camera_cell, q, session.path(f"3-measured/{name}"), seed=seed + number, say=progress)
+            images = session.path(f"3-measured/{name}")
+            take_pictures(camera_cell, q, images, seed=seed + number, say=progress)
         say("    (the simulated camera takes an image at every pose of both lists)")
     elif step in ("measure", "validate"):
         simulate_measurements(session, cell, seed)
@@ -221,16 +254,19 @@ def simulate_measurements(session: Session, cell: Cell, seed: int) -> None:
     """Simulate measurements of the planned poses, with three repeated at the end and drift of the CMM."""
     _mark(session, cell.note)
     for number, name, q in planned_poses(session.folder, cell.nominal):
-        measured = wandering(measure(cell, q, np.random.default_rng([seed, number]), warm=number * FIT), DRIFT, seed)
-        write_measured(measured, session.path(f"3-measured/{name}.csv"))
+        noise = np.random.default_rng([seed, number])
+        measured = measure(cell, q, noise, warm=number * FIT)
+        write_measured(wandering(measured, DRIFT, seed), session.path(f"3-measured/{name}.csv"))
         if name == "measured":
-            repeated = measure(cell, q[:AGAIN], np.random.default_rng([seed, 7]), warm=len(q))
+            noise = np.random.default_rng([seed, 7])
+            repeated = measure(cell, q[:REPEATED], noise, warm=len(q))
             write_measured(wandering(repeated, DRIFT, seed, begin=1.0), session.path("3-measured/drift.csv"))
 
 
 def _mark(session: Session, note: str) -> None:
     """Mark a session's files as simulated, for its certificate."""
-    path, line = session.path(MARK), SIMULATED.format(note=note)
+    path = session.path(MARK)
+    line = SIMULATED.format(note=note)
     marks = list(read_lines(path))
     if line not in marks:
         marks.append(line)
@@ -241,11 +277,17 @@ def simulate_recordings(session: Session, arm: MovingArm, seed: int) -> None:
     """Simulate recordings of the designed motions."""
     _mark(session, arm.note)
     motions = dynamics_steps.designed_motions(session)
-    rounds = [(name, int(name.removeprefix(ROUND)) + 10, 720.0) for name in motions if name.startswith(ROUND)]
-    for name, number, running in (*LOGS, *rounds):
+    logs = list(LOGS)
+    for name in motions:
+        if name.startswith(ROUND):
+            noise_seed = int(name.removeprefix(ROUND)) + 10
+            logs.append((name, noise_seed, ROUND_RUNNING))
+    for name, noise_seed, running in logs:
         if name not in motions:
             continue
-        t = np.arange(round(motions[name].period * motions[name].rate) + 1) / motions[name].rate
-        reference = play(t, *motions[name].orders(t), motions[name].repeat)
-        recorded = record(arm, reference, np.random.default_rng([seed, number]), running)
+        motion = motions[name]
+        t = np.arange(round(motion.period * motion.rate) + 1) / motion.rate
+        reference = play(t, *motion.orders(t), motion.repeat)
+        noise = np.random.default_rng([seed, noise_seed])
+        recorded = record(arm, reference, noise, running)
         write_log(recorded, session.path(f"7-recorded/{name}_log.csv"))

@@ -14,10 +14,12 @@ from calib.procedure.report.style import AFTER, BEFORE, BROWN, INK, QUIET
 from calib.procedure.session.folder import Session
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.results import position_errors, torque_error
-from calib.toolkit.opened_results import drawn, skeleton
+from calib.toolkit.result_folders import drawn, skeleton
 
-AZIMUTH, ELEVATION = np.deg2rad([-60.0, 20.0])  # from where the cell is seen
-HEIGHT = 2.5  # [in]
+# from where the cell is seen
+AZIMUTH, ELEVATION = np.deg2rad([-60.0, 20.0])
+# [in]
+HEIGHT = 2.5
 
 
 def draw(session: Session) -> None:
@@ -30,30 +32,43 @@ def draw(session: Session) -> None:
 
 def _seen_from(points: np.ndarray) -> np.ndarray:
     """Return points (..., 3) [m] as seen from afar: (..., 2), to the right and up."""
-    (c, s), (ce, se) = ((np.cos(angle), np.sin(angle)) for angle in (AZIMUTH, ELEVATION))
-    return points @ np.array([[-s, c, 0.0], [-se * c, -se * s, ce]]).T
+    cos_azimuth, sin_azimuth = np.cos(AZIMUTH), np.sin(AZIMUTH)
+    cos_elevation, sin_elevation = np.cos(ELEVATION), np.sin(ELEVATION)
+    right = [-sin_azimuth, cos_azimuth, 0.0]
+    up = [-sin_elevation * cos_azimuth, -sin_elevation * sin_azimuth, cos_elevation]
+    return points @ np.array([right, up]).T
 
 
 def _cell(session: Session) -> Panel:
     """Return the arm at one of its poses, and the errors at all poses before and after, enlarged."""
-    (measured,), chain = drawn(session.folder).measured, chain_of(session)
-    scale, arm = measured.arrow_scale(chain), _seen_from(skeleton(chain, measured.q))
-    x, y = arm[int(np.argmax(arm[:, -1, 1] + np.abs(arm[:, -1, 0])))].T
+    chain = chain_of(session)
+    (measured,) = drawn(session.folder).measured
+    scale = measured.arrow_scale(chain)
+    # the pose that reaches farthest to the side and up
+    arms = _seen_from(skeleton(chain, measured.q))
+    tips = arms[:, -1]
+    farthest = int(np.argmax(tips[:, 1] + np.abs(tips[:, 0])))
+    x, y = arms[farthest].T
     layers = [line(x, y, colour=QUIET, width=5.0), line(x, y, "o", colour=INK, size=4.0)]
     for points, colour in ((measured.nominal, BEFORE), (measured.calibrated, AFTER)):
+        # strokes from the measured points, with a gap behind each
         ends = measured.seen + scale * (points - measured.seen)
-        strokes = np.stack([_seen_from(measured.seen), _seen_from(ends), np.full((len(ends), 2), np.nan)], axis=1)
-        layers.append(line(strokes[..., 0].ravel(), strokes[..., 1].ravel(), colour=colour, width=1.4))
+        gaps = np.full((len(ends), 2), np.nan)
+        strokes = np.stack([_seen_from(measured.seen), _seen_from(ends), gaps], axis=1)
+        x, y = strokes.reshape(-1, 2).T
+        layers.append(line(x, y, colour=colour, width=1.4))
     return Panel(layers, f"{len(measured.q)} poses, errors × {scale:g}", "[m]", "[m]", equal=True, ticks=5)
 
 
 def _errors(session: Session) -> Panel:
     """Return the histogram of the errors of nominal robot and robot.urdf on unseen poses."""
-    (rows,) = (rows_set for rows_set in fit_report.read(session.validation.report).sets if rows_set.unseen)
-    nominal = np.array(rows.nominal["position"])
-    urdf = np.array((rows.urdf_alone or rows.calibrated)["position"])
+    sets = fit_report.read(session.validation.report).sets
+    (unseen,) = (rows for rows in sets if rows.unseen)
+    nominal = np.array(unseen.nominal["position"])
+    urdf = np.array((unseen.urdf_alone or unseen.calibrated)["position"])
     before, after = position_errors(session) or (np.nan, np.nan)
-    return replace(error_histogram(nominal, urdf).panels[0], title=f"unseen poses: {before:.2f} → {after:.2f} mm")
+    panel = error_histogram(nominal, urdf).panels[0]
+    return replace(panel, title=f"unseen poses: {before:.2f} → {after:.2f} mm")
 
 
 def _torque(session: Session) -> Panel:
@@ -63,20 +78,27 @@ def _torque(session: Session) -> Panel:
     t = np.array(curves.t, dtype=float).T
     measured = np.array(curves.measured, dtype=float).T
     predicted = np.array(curves.predicted, dtype=float).T
-    j = int(np.argmax(np.linalg.norm(measured, axis=0)))
-    low, high = measured[:, j].min(), measured[:, j].max()
-    above = high + 0.1 * (high - low)
+    joint = int(np.argmax(np.linalg.norm(measured, axis=0)))
+    measured, predicted = measured[:, joint], predicted[:, joint]
+    low, high = measured.min(), measured.max()
+
     layers = []
-    for name, at, values, colour, width in (
+    label_height = high + 0.1 * (high - low)
+    for name, share, values, colour, width in (
         ("measured", 0.03, measured, BROWN, 1.6),
         ("predicted", 0.38, predicted, AFTER, 0.8),
         ("residual", 0.7, measured - predicted, QUIET, 0.6),
     ):
-        layers.append(line(t, values[:, j], colour=colour, width=width))
-        layers.append(text(name, t[0] + at * (t[-1] - t[0]), above, (0, 0), colour))
-    title, y = f"{torque_error(session):.1f} % of torque unexplained", f"{unseen.rows[j]} [{unseen.units[j]}]"
+        label_time = t[0] + share * (t[-1] - t[0])
+        layers.append(line(t, values, colour=colour, width=width))
+        layers.append(text(name, label_time, label_height, (0, 0), colour))
+
+    error = torque_error(session)
+    title = f"{error:.1f} % of torque unexplained"
     outcome = prediction(session.path(session.export))
     if outcome is not None:
         # of the exported robot, in brackets of the identified model
-        title = f"{outcome.exported:.1f} % ({torque_error(session):.1f} %) unexplained"
-    return Panel(layers, title, "unseen motion [s]", y, xlim=(t[0], t[-1]), ylim=(1.1 * low, 1.1 * above))
+        title = f"{outcome.exported:.1f} % ({error:.1f} %) unexplained"
+    y_label = f"{unseen.rows[joint]} [{unseen.units[joint]}]"
+    x_limits, y_limits = (t[0], t[-1]), (1.1 * low, 1.1 * label_height)
+    return Panel(layers, title, "unseen motion [s]", y_label, xlim=x_limits, ylim=y_limits)

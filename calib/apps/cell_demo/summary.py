@@ -4,7 +4,7 @@ In letters that every terminal has, at most 60 of them a line.
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from math import nan
 from shutil import get_terminal_size
@@ -23,7 +23,8 @@ from calib.procedure.session.results import position_errors, torque_error
 from calib.procedure.session.steps import steps_of
 
 PICTURE = "demo.png"
-SECONDS = {  # of processor time, about, by which the share done is told
+# processor time of each step, about, by which the share done is told [s]
+SECONDS = {
     "select": 1.0,
     "fit": 1.0,
     "validate": 0.1,
@@ -41,37 +42,39 @@ def row(name: str, number: float, meaning: str) -> str:
     return f"{name:<11} {number:>6.3g} {meaning}"
 
 
-def _exported(session: Session) -> tuple[float, str]:
-    outcome, out = prediction(session.path(session.export)), session.path(session.export)
-    if outcome is None:
-        return len(list(out.iterdir())), "files for other programs"
-    return outcome.exported, "% unexplained by the exported robot"
-
-
-def _minutes(session: Session) -> float:
-    """Return how long the run through the poses takes [min], the time to settle included."""
-    return read_table(session.path(f"2-poses/{WAYS}")).cells[0][-1] / 60.0
-
-
-NUMBERS: Mapping[str, Callable[[Session], tuple[float, str]]] = {
-    "describe": lambda s: (chain_of(s).n, f"joints: {s.settings.name}, simulated, errors hidden"),
-    "select": lambda s: (s.settings.poses.fit, "poses chosen to measure"),
-    "measure": lambda s: (_minutes(s), "min at the robot to measure them"),
-    "fit": lambda s: (len(read_estimate(s.fit.path)), "parameters of its geometry, with sigma"),
-    "validate": lambda s: (
-        (position_errors(s) or (nan, nan))[1],
-        f"mm error left on unseen poses: {s.validation.metrics().verdict}",
-    ),
-    "excite": lambda s: (s.settings.dynamics.period, "s of motion designed for its dynamics"),
-    "record": lambda s: (s.settings.dynamics.repeats, "periods of it logged, with torques"),
-    "identify": lambda s: (len(read_estimate(s.identification.path)), "parameters of its dynamics, with sigma"),
-    "predict": lambda s: (
-        torque_error(s) or nan,
-        f"% unexplained by identified model: {s.identification.unseen.read().verdict}",
-    ),
-    "export": _exported,
-}
-"""Number of each step and what it is, read from the session's folders."""
+def _number(session: Session, step: str) -> tuple[float, str] | None:
+    """Return the number of a step and what it is, read from the session's folders; None for steps without one."""
+    settings = session.settings
+    match step:
+        case "describe":
+            return chain_of(session).n, f"joints: {settings.name}, simulated, errors hidden"
+        case "select":
+            return settings.poses.fit, "poses chosen to measure"
+        case "measure":
+            # the run through the poses, the time to settle included
+            seconds = read_table(session.path(f"2-poses/{WAYS}")).cells[0][-1]
+            return seconds / 60.0, "min at the robot to measure them"
+        case "fit":
+            return len(read_estimate(session.fit.path)), "parameters of its geometry, with sigma"
+        case "validate":
+            errors = position_errors(session) or (nan, nan)
+            return errors[1], f"mm error left on unseen poses: {session.validation.metrics().verdict}"
+        case "excite":
+            return settings.dynamics.period, "s of motion designed for its dynamics"
+        case "record":
+            return settings.dynamics.repeats, "periods of it logged, with torques"
+        case "identify":
+            return len(read_estimate(session.identification.path)), "parameters of its dynamics, with sigma"
+        case "predict":
+            verdict = session.identification.unseen.read().verdict
+            return torque_error(session) or nan, f"% unexplained by identified model: {verdict}"
+        case "export":
+            folder = session.path(session.export)
+            outcome = prediction(folder)
+            if outcome is None:
+                return len(list(folder.iterdir())), "files for other programs"
+            return outcome.exported, "% unexplained by the exported robot"
+    return None
 
 
 @dataclass
@@ -79,7 +82,7 @@ class Telling:
     """Tells of a session as it goes on.
 
     Attributes:
-        say, show: lines that stay, and words that pass.
+        say, show: print a permanent line, and show a transient status.
         verbose: whether all that the session says is told besides.
     """
 
@@ -88,7 +91,7 @@ class Telling:
     show: Say
     verbose: bool = False
     began: float = field(default_factory=time.perf_counter)
-    _told: set[str] = field(default_factory=set)
+    _printed: set[str] = field(default_factory=set)
     _step: str = ""
     _entered: float = 0.0
 
@@ -96,37 +99,43 @@ class Telling:
         """Tell what the session says: of a step that is done its line, once, and if verbose all its words."""
         for line in lines:
             step = line.partition(":")[0].rpartition(" ")[2]
-            if line[:1].isdigit() and step in NUMBERS:
-                summary_line = row(step, *NUMBERS[step](self.session))
-                self.say(*({summary_line} - self._told))
-                self._told.add(summary_line)
+            number = _number(self.session, step) if line[:1].isdigit() else None
+            if number is not None:
+                summary_line = row(step, *number)
+                if summary_line not in self._printed:
+                    self.say(summary_line)
+                self._printed.add(summary_line)
             if self.verbose:
                 self.say(f"    - {line.strip()}")
 
     def progress(self, text: str) -> None:
-        """Show the stage, the share done and the time left; `words`: a stage's purpose, or what it does."""
-        moment, steps = time.perf_counter(), steps_of(self.session)
-        purposes = {step.purpose: step.name for step in steps}
-        if text in purposes:
-            self._step, self._entered = purposes[text], moment
-        names = list(purposes.values())
-        before = sum(SECONDS.get(name, 0.0) for name in names[: names.index(self._step)])
+        """Show the stage, the share done and the time left; `text`: a stage's purpose, or what it does."""
+        moment = time.perf_counter()
+        steps = steps_of(self.session)
+        names = [step.name for step in steps]
+        for step in steps:
+            if step.purpose == text:
+                self._step, self._entered = step.name, moment
+        index = names.index(self._step)
+        # processor time of the steps before, of all steps and of this one, and what has passed of it
+        durations = [SECONDS.get(name, 0.0) for name in names]
+        before, total = sum(durations[:index]), sum(durations)
         pace = (self._entered - self.began) / before if before else 1.0
-        total, step_seconds = sum(SECONDS.get(name, 0.0) for name in names), SECONDS.get(self._step, 0.0)
-        finished = before + min((moment - self._entered) / pace, 0.95 * step_seconds)
-        stage = steps[names.index(self._step)].purpose
-        text = f"{finished / total:.0%} done, {(total - finished) * pace:.0f} s left: {stage}"
-        self.show(text[: get_terminal_size().columns - 3])  # the spinner and the cursor need the rest
+        finished = before + min((moment - self._entered) / pace, 0.95 * durations[index])
+        status = f"{finished / total:.0%} done, {(total - finished) * pace:.0f} s left: {steps[index].purpose}"
+        # the spinner and the cursor need the rest
+        self.show(status[: get_terminal_size().columns - 3])
 
 
 def reasons(session: Session) -> Iterator[str]:
     """Yield what a verdict other than pass means, and the commands that explain its reasons."""
-    reports: list[ValidationMetrics | UnseenReport] = [session.validation.metrics()]
-    reports += [session.identification.unseen.read()] if session.dynamic else []
-    for stage, report in zip(("geometry", "dynamics"), reports):
+    reports: dict[str, ValidationMetrics | UnseenReport] = {"geometry": session.validation.metrics()}
+    if session.dynamic:
+        reports["dynamics"] = session.identification.unseen.read()
+    for stage, report in reports.items():
         if report.verdict != "pass":
             yield f"{stage}: {report.verdict}; why: {command_line('explain', report.code)}"
-    if "marginal" in (report.verdict for report in reports):
+    if any(report.verdict == "marginal" for report in reports.values()):
         yield "marginal: better than nominal, but a check has a doubt;"
         yield "read the reasons before you use it."
 
@@ -142,5 +151,9 @@ def paths(session: Session) -> list[str]:
         "truth": "truth.txt",
         "fit": "4-fit",
     }
-    existing = [f"{name:<11} {path}" for name, file in candidates.items() if (path := session.path(file)).exists()]
+    existing = []
+    for name, file in candidates.items():
+        path = session.path(file)
+        if path.exists():
+            existing.append(f"{name:<11} {path}")
     return [*existing[1:5], existing[0]]

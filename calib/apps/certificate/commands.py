@@ -23,6 +23,6 @@ def certificate(folder: Path, details: CertificateSection, svg: Path | None = No
         folder: of a fit, an identification, or a finished session
         svg: folder for all figures of the report as SVG
     """
-    from calib.toolkit.opened_results import open_result
+    from calib.toolkit.result_folders import open_result
 
     say(*open_result(folder, "certificate").certify(details, plots, svg))

@@ -69,22 +69,29 @@ def compensate(
     from calib.errors import UsageError
     from calib.procedure.export.geometry import results
 
-    may = numbers(tolerance, 2, "--tolerance")
+    position_mm, turn_mrad = numbers(tolerance, 2, "--tolerance")
     fitted = api.read_fitted(folder)
-    program = read_program(targets, controller) if controller or is_program(targets) else None
+    program = None
+    suffix = ".csv"
+    if controller or is_program(targets):
+        program = read_program(targets, controller)
+        suffix = targets.suffix
     if program is not None and targets.suffix.lower() in program.controller.saved:
         message = (
             "lists registers that the controller saved, no program: compensate the program, or calib program --for csv"
         )
         raise UsageError(f"{targets}: {message}")
-    written = [(out, (".csv",) if program is None else (targets.suffix,))]
+    written = [(out, (suffix,))]
     files.check_results(written, [targets, *results(fitted.folder)], overwrite)
+    start_q = None
+    if start:
+        start_q = numbers(start, fitted.nominal.chain.n, "--start")
     options: FieldValues = {
         "frame": frame,
         "dof": dof,
-        "tolerance": (1e-3 * may[0], 1e-3 * may[1]),
+        "tolerance": (1e-3 * position_mm, 1e-3 * turn_mrad),
         "seed": seed,
-        "start": numbers(start, fitted.nominal.chain.n, "--start") if start else None,
+        "start": start_q,
     }
     if program is None and (user_frame or frames or world or flange):
         raise UsageError("--user-frame, --frames, --world and --flange are for programs; a CSV stands in --frame")

@@ -37,16 +37,38 @@ from calib.procedure.kinematic_stage.folder import VALIDATED, ValidationFolder
 from calib.procedure.kinematic_stage.tables import read_covariance
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
-from calib.toolkit.opened_results import open_result
+from calib.toolkit.result_folders import open_result
 from calib.transforms import from_xyz_rpy, invert, pose, rotation_vector
 
-TOLERANCE = (1e-6, 1e-5)  # position [m] and orientation [rad] that a command may leave; our choice, as what follows
-MAX_CORRECTION = 0.2  # correction of one joint [rad or m] beyond which the arm is held back: it is near a singularity
-SINGULAR = 0.02  # singular values of the Jacobian, smallest over largest
-ASTRAY = 0.01  # further from a target than this no singularity is to blame [m]
-LIMIT_TOLERANCE = 1e-9  # [rad or m]
-STARTS = 24  # random starts for each target without joints
+# Thresholds are our choice.
+# position [m] and orientation [rad] that a command may leave
+TOLERANCE = (1e-6, 1e-5)
+# correction of one joint [rad or m] beyond which the arm is held back: it is near a singularity
+MAX_CORRECTION = 0.2
+# singular values of the Jacobian, smallest over largest
+SINGULAR = 0.02
+# further from a target than this no singularity is to blame [m]
+ASTRAY = 0.01
+# [rad or m]
+LIMIT_TOLERANCE = 1e-9
+# random starts for each target without joints
+STARTS = 24
 COMPONENTS = {6: "position and orientation", 5: "position and the direction of the tool's z axis", 3: "position only"}
+# targets that a message lists
+MAX_LISTED = 20
+# of COMMANDS.csv behind the status
+COLUMNS = (
+    "left [mm]",
+    "left [mrad]",
+    "before [mm]",
+    "before [mrad]",
+    "sigma [mm]",
+    "sigma [mrad]",
+    "unseen_rms [mm]",
+    "expected [mm]",
+    "interval95 [mm]",
+    "extrapolated",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +81,8 @@ class Fitted:
         free, covariance: of the fit's parameters, see `read_covariance`.
         unseen: rms error of the calibrated arm on unseen poses [m]; None without such poses.
         fitted: rms error on the fitted poses [m].
-        learnt: (k, n) poses that were fitted [rad or m], and `discrepancy`: what makes errors at others likely; None
-            where the fit does not say.
+        fitted_q: (k, n) joint values of the fitted poses [rad or m], and `discrepancy`: variance model of the error at
+            other poses; None where the fit does not say.
     """
 
     folder: Path
@@ -70,13 +92,14 @@ class Fitted:
     covariance: np.ndarray
     unseen: float | None
     fitted: float | None
-    learnt: np.ndarray | None = None
+    fitted_q: np.ndarray | None = None
     discrepancy: Discrepancy | None = None
 
     @property
     def placed(self) -> bool:
         """Whether the fit contains the placement of the nominal robot."""
-        return bool(len(self.nominal.stations)) and set(self.cell.station_names) <= set(self.nominal.station_names)
+        stations = self.nominal.station_names
+        return bool(len(self.nominal.stations)) and set(self.cell.station_names) <= set(stations)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,23 +147,30 @@ def read(folder: str | Path) -> Fitted:
         UsageError: where it is none, or lacks something.
     """
     result = open_result(folder, "compensate")
-    fit = result.fit("compensate")
+    fit = result.fit
     if fit is None:
         result.refuse("compensate")
-    proof = ValidationFolder(Path(folder) / VALIDATED)
     cell, nominal = installation.read_arms(fit.path)
     free, covariance = read_covariance(fit.path, cell)
+
     metrics = fit.metrics()
-    judged_metrics = proof.metrics() if proof.judged.is_file() else metrics
-    accuracies = [metrics.fit.calibrated, *(errors.calibrated for errors in judged_metrics.validation.values())]
-    rms = [1e-3 * accuracy.main.rms for accuracy in accuracies if accuracy.main]
-    unseen = max(rms[1:], default=None)
-    fitted = rms[0] if rms else None
-    fitted_joints = fit.learnt_joints(cell.chain.joints)
+    validation_metrics = metrics
+    validation = ValidationFolder(Path(folder) / VALIDATED)
+    if validation.judged.is_file():
+        validation_metrics = validation.metrics()
+    unseen_rms = []
+    for errors in validation_metrics.validation.values():
+        accuracy = errors.calibrated.main
+        if accuracy:
+            unseen_rms.append(1e-3 * accuracy.rms)
+    unseen = max(unseen_rms, default=None)
+    fit_accuracy = metrics.fit.calibrated.main
+    fitted = 1e-3 * fit_accuracy.rms if fit_accuracy else None
+    fitted_q = fit.learnt_joints(cell.chain.joints)
     discrepancy = None
     if metrics.findings is not None:
         discrepancy = metrics.findings.discrepancy
-    return Fitted(fit.path, cell, nominal, free, covariance, unseen, fitted, fitted_joints, discrepancy)
+    return Fitted(fit.path, cell, nominal, free, covariance, unseen, fitted, fitted_q, discrepancy)
 
 
 def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tuple[Installation, Installation]:
@@ -155,21 +185,20 @@ def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tup
     """
     cell, nominal = fitted.cell, fitted.nominal
     tool_pose = _tool(cell, tool)
-    if frame == "base":
-        stations, behind = (np.eye(4), np.eye(4)), np.eye(4)
-    else:
+    # the nominal robot's flange need not be the calibrated one's
+    T_flange_flange = np.eye(4)
+    station = nominal_station = np.eye(4)
+    if frame != "base":
         k = _station(fitted, frame)
+        nominal_station, station = nominal.stations[k], cell.stations[k]
         t = cell.tool_names.index(tool) if tool in cell.tool_names else 0
-        stations = nominal.stations[k], cell.stations[k]
-        behind = nominal.tools[t] @ invert(cell.tools[t])  # the nominal robot's flange need not be the calibrated one's
+        T_flange_flange = nominal.tools[t] @ invert(cell.tools[t])
         if frame == "nominal":
-            stations = np.eye(4), invert(stations[0]) @ stations[1]
-    tools = behind @ tool_pose, tool_pose
-    arms = replace(nominal, deflection=Deflection()), cell
-    nominal_arm, calibrated_arm = (
-        replace(arm, stations=s[None], tools=t[None], station_names=(frame,), tool_names=(tool,))
-        for arm, s, t in zip(arms, stations, tools)
-    )
+            nominal_station, station = np.eye(4), invert(nominal_station) @ station
+    names = {"station_names": (frame,), "tool_names": (tool,)}
+    rigid = replace(nominal, deflection=Deflection())
+    nominal_arm = replace(rigid, stations=nominal_station[None], tools=(T_flange_flange @ tool_pose)[None], **names)
+    calibrated_arm = replace(cell, stations=station[None], tools=tool_pose[None], **names)
     return nominal_arm, calibrated_arm
 
 
@@ -236,60 +265,76 @@ def computed(
         raise UsageError(f"tolerance {text}: expected two numbers above 0")
     say = progress or (lambda message: None)
     nominal_cell, calibrated_cell = placements(fitted, frame, tool)
-    count, note = _dof(targets, nominal_cell.chain, dof)
-    lower, upper = nominal_cell.chain.lower, nominal_cell.chain.upper
-    before, after = Goal(nominal_cell, count, lower, upper), Goal(calibrated_cell, count, lower, upper)
-    if start is not None and not _inside(before, np.asarray(start)):
-        raise UsageError(f"start {list(start)}: outside the joints' limits {lower.tolist()} to {upper.tolist()}")
+    chain = nominal_cell.chain
+    count, dof_note = _dof(targets, chain, dof)
+    nominal_goal = Goal(nominal_cell, count, chain.lower, chain.upper)
+    goal = Goal(calibrated_cell, count, chain.lower, chain.upper)
+    if start is not None and not _inside(nominal_goal, np.asarray(start)):
+        limits = f"{chain.lower.tolist()} to {chain.upper.tolist()}"
+        raise UsageError(f"start {list(start)}: outside the joints' limits {limits}")
+
     say("the nominal robot at the targets")
-    poses, q0 = _reference(before, targets, start, seed)
+    poses, nominal_q = _reference(nominal_goal, targets, start, seed)
     say("the calibrated robot")
-    start_q, q = np.clip(q0, lower, upper), _followed(after, poses, q0)
-    residual, missed = (_sizes(inverse.differences(after, joint_values, poses)) for joint_values in (q, start_q))
-    reached = _within(residual, tolerance) & _inside(before, q0)
-    singular = inverse.conditions(after, q0) < SINGULAR
-    extrapolated = np.zeros(q.shape, bool) if fitted.learnt is None else np.atleast_2d(outside(q, fitted.learnt))
-    reason = tuple(_reason(nominal_cell.chain, *row) for row in zip(reached, extrapolated, q0, q, residual, singular))
+    q = _followed(goal, poses, nominal_q)
+    residual = _sizes(inverse.differences(goal, q, poses))
+    start_q = np.clip(nominal_q, chain.lower, chain.upper)
+    nominal_residual = _sizes(inverse.differences(goal, start_q, poses))
+    reached = _within(residual, tolerance) & _inside(nominal_goal, nominal_q)
+    singular = inverse.conditions(goal, nominal_q) < SINGULAR
+    extrapolated = np.zeros(q.shape, bool)
+    if fitted.fitted_q is not None:
+        extrapolated = np.atleast_2d(outside(q, fitted.fitted_q))
+    rows = zip(reached, extrapolated, nominal_q, q, residual, singular)
+    reasons = [_reason(chain, *row) for row in rows]
+
     say("sigmas")
-    sigma, expected = _predicted_sigmas(fitted, q, frame, tool, after)
-    notes = (_frame_note(fitted, frame), finding("at-targets", tool=tool), note, *_turn_note(fitted, count))
+    sigma, expected = _predicted_sigmas(fitted, q, frame, tool, goal)
+    notes = [_frame_note(fitted, frame), finding("at-targets", tool=tool), dof_note, *_turn_note(fitted, count)]
     arm_error = None
     if frame == "base" and fitted.placed:
-        placed, real = placements(fitted, "nominal", tool)
-        arm_error = _sizes(inverse.differences(replace(after, cell=real), start_q, see(placed, start_q).poses()))
+        # the arm's own error, its base placed where it fits the measurements best
+        placed_nominal, placed_cell = placements(fitted, "nominal", tool)
+        nominal_poses = see(placed_nominal, start_q).poses()
+        arm_error = _sizes(inverse.differences(replace(goal, cell=placed_cell), start_q, nominal_poses))
     return Commands(
-        targets,
-        fitted,
-        q,
-        q0,
-        reached,
-        reason,
-        residual,
-        missed,
-        sigma,
-        expected,
-        extrapolated,
-        count,
-        tuple(lines_of(notes)),
-        arm_error,
+        targets=targets,
+        fitted=fitted,
+        q=q,
+        nominal=nominal_q,
+        reached=reached,
+        reason=tuple(reasons),
+        left=residual,
+        before=nominal_residual,
+        sigma=sigma,
+        expected=expected,
+        beyond=extrapolated,
+        dof=count,
+        notes=tuple(lines_of(notes)),
+        own=arm_error,
     )
 
 
 def _inside(goal: Goal, q: np.ndarray) -> np.ndarray:
-    return np.all((q >= goal.lower - LIMIT_TOLERANCE) & (q <= goal.upper + LIMIT_TOLERANCE), axis=-1)
+    above = q >= goal.lower - LIMIT_TOLERANCE
+    below = q <= goal.upper + LIMIT_TOLERANCE
+    return np.all(above & below, axis=-1)
 
 
 def _followed(goal: Goal, poses: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Return joint values (m, n) near `start` that reach the poses; near a singularity they stay close to `start`."""
-    q = inverse.nearest(goal, poses, np.clip(start, goal.lower, goal.upper), inverse.reach(goal, poses, start))
-    excessive = np.flatnonzero(np.abs(q - start).max(axis=1, initial=0.0) > MAX_CORRECTION)
+    clipped = np.clip(start, goal.lower, goal.upper)
+    q = inverse.nearest(goal, poses, clipped, inverse.reach(goal, poses, start))
+    largest_correction = np.abs(q - start).max(axis=1, initial=0.0)
+    excessive = np.flatnonzero(largest_correction > MAX_CORRECTION)
     q[excessive] = inverse.held_back(goal, poses[excessive], start[excessive], MAX_CORRECTION)
     return q
 
 
 def _dof(targets: Targets, chain: Chain, requested: int | None) -> tuple[int, Finding]:
     """Return the number of pose components (6, 5 or 3) that targets determine, and the finding on it."""
-    oriented = targets.rotation is not None or (targets.q is not None and targets.position is None)
+    joints_only = targets.q is not None and targets.position is None
+    oriented = targets.rotation is not None or joints_only
     available = 6 if oriented else 3
     able = 3
     if chain.n >= 5:
@@ -300,7 +345,10 @@ def _dof(targets: Targets, chain: Chain, requested: int | None) -> tuple[int, Fi
         columns = "qx, qy, qz, qw"
         raise UsageError(f"{targets.file}: the targets have no orientation; dof {requested} needs columns {columns}")
     dof = requested or min(available, able)
-    joints = chain.n if requested is None and able < available else None
+    # said where the arm's joints are what limits it
+    joints = None
+    if requested is None and able < available:
+        joints = chain.n
     return dof, finding("what-counts", what=COMPONENTS[dof], joints=joints)
 
 
@@ -312,39 +360,50 @@ def _reference(goal: Goal, targets: Targets, start: Sequence[float] | None, seed
     poses = pose(targets.rotation, targets.position)
     if targets.q is not None:
         reached = inverse.reach(goal, poses, targets.q)
-        return poses, inverse.nearest(goal, poses, np.clip(targets.q, goal.lower, goal.upper), reached)
+        clipped = np.clip(targets.q, goal.lower, goal.upper)
+        return poses, inverse.nearest(goal, poses, clipped, reached)
     lower, upper = goal.cell.chain.sampling_limits()
-    middle = 0.5 * (lower + upper) if start is None else np.asarray(start, dtype=float)
-    starts = np.random.default_rng(seed).uniform(lower, upper, (STARTS, len(lower)))
-    return poses, _sought(goal, poses, middle, starts)
+    if start is None:
+        middle = 0.5 * (lower + upper)
+    else:
+        middle = np.asarray(start, dtype=float)
+    random_starts = np.random.default_rng(seed).uniform(lower, upper, (STARTS, len(lower)))
+    return poses, _sought(goal, poses, middle, random_starts)
 
 
 def _sought(goal: Goal, poses: np.ndarray, start: np.ndarray, starts: np.ndarray) -> np.ndarray:
     """Return the nominal robot's joint positions (m, n): of several solutions, the one nearest to `start`."""
-    best, cost = np.tile(start, (len(poses), 1)), np.full(len(poses), np.inf)
+    best = np.tile(start, (len(poses), 1))
+    cost = np.full(len(poses), np.inf)
     for first in (start, *starts):
         q = inverse.reach(goal, poses, np.tile(first, (len(poses), 1)))
-        met = _within(_sizes(inverse.differences(goal, q, poses)), TOLERANCE)
-        travel = np.where(met, np.abs(q - start).max(axis=1), np.inf)
+        residual = _sizes(inverse.differences(goal, q, poses))
+        travel = np.abs(q - start).max(axis=1)
+        travel = np.where(_within(residual, TOLERANCE), travel, np.inf)
         better = travel < cost
-        best[better], cost[better] = q[better], travel[better]
+        best[better] = q[better]
+        cost[better] = travel[better]
     return best
 
 
 def _sizes(difference: np.ndarray) -> np.ndarray:
     """Return the lengths (m, 2) of position [m] and orientation [rad] differences; NaN without orientations."""
     position = np.linalg.norm(difference[:, :3], axis=1)
-    turn = np.linalg.norm(difference[:, 3:], axis=1) if difference.shape[1] > 3 else np.full(len(position), np.nan)
+    turn = np.full(len(position), np.nan)
+    if difference.shape[1] > 3:
+        turn = np.linalg.norm(difference[:, 3:], axis=1)
     return np.stack([position, turn], axis=1)
 
 
 def _within(sizes: np.ndarray, tolerance: tuple[float, float]) -> np.ndarray:
-    return (sizes[:, 0] <= tolerance[0]) & ~(sizes[:, 1] > tolerance[1])
+    """Return which sizes (m, 2) are within a tolerance (m,); an orientation that does not count (NaN) is."""
+    position, turn = sizes.T
+    return (position <= tolerance[0]) & ~(turn > tolerance[1])
 
 
 def _reason(
     chain: Chain,
-    good: bool,
+    reached: bool,
     extrapolated: np.ndarray,
     nominal: np.ndarray,
     q: np.ndarray,
@@ -352,16 +411,23 @@ def _reason(
     singular: bool,
 ) -> str:
     """Return why a target is not reached, or which of its joint values are outside the measured range; else ""."""
-    if good:
+    if reached:
         names = [name for name, out in zip(chain.joint_names, extrapolated) if out]
-        return sentence(finding("command-extrapolates", joints=names)) if names else ""
-    figures = {"left": residual[0], "turn": None if np.isnan(residual[1]) else residual[1]}
-    for name, value, low, high in zip(chain.joint_names, nominal, chain.lower, chain.upper):
-        if not low - LIMIT_TOLERANCE <= value <= high + LIMIT_TOLERANCE:
-            return sentence(finding("target-outside-limits", joint=name, value=value, low=low, high=high))
-    if at := [name for name, v, j in zip(chain.joint_names, q, chain.joints) if v <= j.lower or v >= j.upper]:
-        return sentence(finding("at-limit", joints=at, **figures))
-    code = "near-singularity" if singular and residual[0] < ASTRAY else "out-of-reach"
+        if not names:
+            return ""
+        return sentence(finding("command-extrapolates", joints=names))
+    for joint, value in zip(chain.joints, nominal):
+        if not joint.lower - LIMIT_TOLERANCE <= value <= joint.upper + LIMIT_TOLERANCE:
+            limits = {"low": joint.lower, "high": joint.upper}
+            return sentence(finding("target-outside-limits", joint=joint.name, value=value, **limits))
+    position_error, turn_error = residual
+    figures = {"left": position_error, "turn": None if np.isnan(turn_error) else turn_error}
+    at_limit = [joint.name for joint, value in zip(chain.joints, q) if value <= joint.lower or value >= joint.upper]
+    if at_limit:
+        return sentence(finding("at-limit", joints=at_limit, **figures))
+    code = "out-of-reach"
+    if singular and position_error < ASTRAY:
+        code = "near-singularity"
     return sentence(finding(code, most=MAX_CORRECTION, **figures))
 
 
@@ -373,19 +439,23 @@ def _predicted_sigmas(
     Where the fit did not place the tool, it counts as known.
     """
     cell, free, covariance = fitted.cell, fitted.free, fitted.covariance
-    number = cell.tool_names.index(tool) if tool in cell.tool_names else 0
-    if tool not in cell.tool_names:
-        keep = ~np.isin(free, layout(cell).index("tool"))
-        free, covariance = free[keep], covariance[np.ix_(keep, keep)]
+    if tool in cell.tool_names:
+        tool_index = cell.tool_names.index(tool)
+    else:
+        tool_index = 0
+        arm_columns = ~np.isin(free, layout(cell).index("tool"))
+        free, covariance = free[arm_columns], covariance[np.ix_(arm_columns, arm_columns)]
         cell = replace(cell, tools=np.repeat(goal.cell.tools, len(cell.tools), axis=0))
-    poses = PoseMeasurements(q, cell.chain.joint_names, torque=None if goal.torques is None else goal.torques(q))
     station = -1 if frame == "base" else _station(fitted, frame)
-    parameter_sigma = pose_sigmas(cell, poses, free, covariance, station, number)
-    parameter_sigma[:, 1] = np.nan if goal.dof == 3 else parameter_sigma[:, 1]
-    if fitted.learnt is None or fitted.discrepancy is None:
+    torque = None if goal.torques is None else goal.torques(q)
+    poses = PoseMeasurements(q, cell.chain.joint_names, torque=torque)
+    parameter_sigma = pose_sigmas(cell, poses, free, covariance, station, tool_index)
+    if goal.dof == 3:
+        parameter_sigma[:, 1] = np.nan
+    if fitted.fitted_q is None or fitted.discrepancy is None:
         return parameter_sigma, np.full((len(q), 2), np.nan)
-    errors = ErrorModel(cell, free, covariance, fitted.learnt, fitted.discrepancy)
-    sigma = errors.position_sigma(poses, station, number)
+    errors = ErrorModel(cell, free, covariance, fitted.fitted_q, fitted.discrepancy)
+    sigma = errors.position_sigma(poses, station, tool_index)
     return parameter_sigma, np.column_stack([sigma, fitted.discrepancy.radius * sigma])
 
 
@@ -396,40 +466,28 @@ def _frame_note(fitted: Fitted, frame: str) -> Finding:
     shift = turn = None
     if fitted.placed:
         between = invert(fitted.nominal.stations[0]) @ fitted.cell.stations[0]
-        shift, turn = np.linalg.norm(between[:3, 3]), np.linalg.norm(rotation_vector(between[:3, :3]))
-    return finding("targets-in-base" if frame == "base" else "targets-in-nominal-base", shift=shift, turn=turn)
+        shift = np.linalg.norm(between[:3, 3])
+        turn = np.linalg.norm(rotation_vector(between[:3, :3]))
+    code = "targets-in-base" if frame == "base" else "targets-in-nominal-base"
+    return finding(code, shift=shift, turn=turn)
 
 
 def _turn_note(fitted: Fitted, dof: int) -> list[Finding]:
     """Return a finding if targets have orientations, but no orientation was measured."""
     table = layout(fitted.cell)
-    measured = {table.names[k] for k in np.intersect1d(fitted.free, table.index("tool"))}
-    if dof == 3 or any(name.rsplit(".", 1)[-1] in ("rx", "ry", "rz") for name in measured):
+    measured = np.intersect1d(fitted.free, table.index("tool"))
+    axes = {table.names[k].rsplit(".", 1)[-1] for k in measured}
+    if dof == 3 or axes & {"rx", "ry", "rz"}:
         return []
     return [finding("no-orientations-measured")]
 
 
-SHOWN = 20  # targets that a message lists
-COLUMNS = (
-    "left [mm]",
-    "left [mrad]",
-    "before [mm]",
-    "before [mrad]",
-    "sigma [mm]",
-    "sigma [mrad]",
-    "unseen_rms [mm]",
-    "expected [mm]",
-    "interval95 [mm]",
-    "extrapolated",
-)
-
-
 def _unreached(commands: Commands) -> list[str]:
-    """Return one line for each target that is not reached, with the reason; at most `SHOWN` lines."""
+    """Return one line for each target that is not reached, with the reason; at most `MAX_LISTED` lines."""
     lost = np.flatnonzero(~commands.reached)
-    result = [f"target {k + 1}: {commands.reason[k]}" for k in lost[:SHOWN]]
-    if len(lost) > SHOWN:
-        result.append(f"{len(lost) - SHOWN} more")
+    result = [f"target {k + 1}: {commands.reason[k]}" for k in lost[:MAX_LISTED]]
+    if len(lost) > MAX_LISTED:
+        result.append(f"{len(lost) - MAX_LISTED} more")
     return result
 
 
@@ -440,63 +498,81 @@ def write(commands: Commands, out: Path, partial: bool = False) -> Path:
         UsageError: where targets are not reached and `partial` does not allow that; nothing is written.
     """
     fitted, targets = commands.fitted, commands.targets
-    lost, count = int(np.sum(~commands.reached)), len(commands.q)
+    count = len(commands.q)
+    lost = int(np.sum(~commands.reached))
     if lost and (not partial or lost == count):
-        advice = "" if lost == count else "\nwith partial (--partial), all other rows are written and these stay empty"
         head = f"{targets.file}: {lost} of {count} targets are not reached; nothing was written"
-        raise UsageError("\n  ".join([head, *_unreached(commands)]) + advice)
-    names = targets.columns or fitted.cell.chain.joint_names
-    q = np.where(commands.reached[:, None], commands.q / (targets.factors or 1.0), np.nan)
+        message = "\n  ".join([head, *_unreached(commands)])
+        if lost != count:
+            message += "\nwith partial (--partial), all other rows are written and these stay empty"
+        raise UsageError(message)
+
+    q = commands.q / (targets.factors or 1.0)
+    q[~commands.reached] = np.nan
     unseen = np.full(count, np.nan if fitted.unseen is None else fitted.unseen)
-    extrapolated = np.full(count, np.nan) if fitted.learnt is None else commands.beyond.any(axis=1)
-    sizes = 1e3 * np.column_stack([commands.left, commands.before, commands.sigma, unseen, commands.expected])
-    statuses = np.where(commands.reached, "reached", "not reached").tolist()
-    columns = zip(q, statuses, sizes, extrapolated.astype(float), commands.reason)
-    rows = [
-        (k, *joints, status, *cells, outside_range, reason)
-        for k, (joints, status, cells, outside_range, reason) in enumerate(columns, 1)
-    ]
+    errors_mm = 1e3 * np.column_stack([commands.left, commands.before, commands.sigma, unseen, commands.expected])
+    extrapolated = np.full(count, np.nan)
+    if fitted.fitted_q is not None:
+        extrapolated = commands.beyond.any(axis=1).astype(float)
+    rows = []
+    for k in range(count):
+        status = "reached" if commands.reached[k] else "not reached"
+        rows.append([k + 1, *q[k], status, *errors_mm[k], extrapolated[k], commands.reason[k]])
+    names = targets.columns or fitted.cell.chain.joint_names
     return files.write_table(out, ["row", *names, "status", *COLUMNS, "reason"], rows)
 
 
 def lines(commands: Commands) -> list[str]:
     """Return the lines for the user: frames, targets that are not reached, errors before and after."""
-    good, targets, fitted = commands.reached, commands.targets, commands.fitted
+    reached, targets, fitted = commands.reached, commands.targets, commands.fitted
     result = [*commands.notes, *targets.notes]
     if targets.ignored:
         result.append(f"ignored columns of {targets.file}: {', '.join(targets.ignored)}")
     result += [f"not reached: {reason}" for reason in _unreached(commands)]
-    before = _rms_pair(commands.before[good])
-    residual = _rms_pair(commands.left[good])
-    sigma = _rms_pair(commands.sigma[good])
-    arm_error = None if commands.own is None else _rms_pair(commands.own[good])
-    findings = [
-        finding("compensated", count=int(good.sum()), before=before, own=arm_error, left=residual, sigma=sigma),
-        _expectation(commands),
-    ]
-    out = commands.beyond & good[:, None]
+
+    count = int(reached.sum())
+    arm_error = None
+    if commands.own is not None:
+        arm_error = _rms_pair(commands.own[reached])
+    compensated = finding(
+        "compensated",
+        count=count,
+        before=_rms_pair(commands.before[reached]),
+        own=arm_error,
+        left=_rms_pair(commands.left[reached]),
+        sigma=_rms_pair(commands.sigma[reached]),
+    )
+    findings = [compensated, _expectation(commands)]
+    out = commands.beyond & reached[:, None]
     if out.any():
-        names = [fitted.cell.chain.joint_names[j] for j in np.unique(np.nonzero(out)[1])]
-        count = int(out.any(axis=1).sum())
-        findings.append(finding("commands-extrapolate", count=count, of=int(good.sum()), joints=names))
-    largest_move = np.abs(commands.q - commands.nominal)[good].max(initial=0.0)
-    return [*result, *lines_of([*findings, finding("joints-move", most=largest_move)])]
+        joints = np.flatnonzero(out.any(axis=0))
+        names = [fitted.cell.chain.joint_names[j] for j in joints]
+        out_count = int(out.any(axis=1).sum())
+        findings.append(finding("commands-extrapolate", count=out_count, of=count, joints=names))
+    moves = np.abs(commands.q - commands.nominal)[reached]
+    findings.append(finding("joints-move", most=moves.max(initial=0.0)))
+    return [*result, *lines_of(findings)]
 
 
 def _expectation(commands: Commands) -> Finding:
     """Return the finding on the expected error of the real arm at these targets, by the error model if available."""
-    good, unseen = commands.reached, commands.fitted.unseen
+    reached, unseen = commands.reached, commands.fitted.unseen
     if not np.isnan(commands.expected).all():
-        rms, within = np.sqrt(np.mean(commands.expected[good, 0] ** 2)), commands.expected[good, 1].max()
-        return finding("expected-at-targets", rms=rms, within=within, unseen=unseen)
+        sigma, radius = commands.expected[reached].T
+        rms = np.sqrt(np.mean(sigma**2))
+        return finding("expected-at-targets", rms=rms, within=radius.max(), unseen=unseen)
     if unseen is None:
         return finding("nothing-unseen", fitted=commands.fitted.fitted)
-    code = "expected-beyond-range" if commands.beyond[good].any() else "expected-as-unseen"
+    code = "expected-as-unseen"
+    if commands.beyond[reached].any():
+        code = "expected-beyond-range"
     return finding(code, unseen=unseen)
 
 
 def _rms_pair(errors: np.ndarray) -> str:
     """Return the rms of errors (m, 2) in position [m] and orientation [rad], for the user."""
-    values = np.sqrt(np.mean(errors**2, axis=0))
-    turn = "" if np.isnan(values[1]) else f" and {1e3 * values[1]:.3g} mrad"
-    return f"{1e3 * values[0]:.3g} mm{turn}"
+    position, turn = np.sqrt(np.mean(errors**2, axis=0))
+    text = f"{1e3 * position:.3g} mm"
+    if not np.isnan(turn):
+        text += f" and {1e3 * turn:.3g} mrad"
+    return text

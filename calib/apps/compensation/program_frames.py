@@ -2,10 +2,8 @@
 
 A pose P in user frame U for a tool T means, in the description's terms, the flange at  B · U · P · T⁻¹ · F⁻¹  of the
 arm's base, with the controller's base B and flange F (`calib.apps.controller_programs.frames`). Numbers are read from
-the
-program and from files beside it (`calib.apps.controller_programs.languages`), or stated; a frame that is neither is
-named, and
-the program is refused.
+the program and from files beside it (`calib.apps.controller_programs.languages`), or stated; a frame that is neither is
+named, and the program is refused.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +19,8 @@ from calib.controllers.table import Controller
 from calib.errors import UsageError, listing
 from calib.transforms import invert, to_xyz_rpy
 
-AGREE = 5e-5  # [m, or as a rotation matrix] a frame that is stated and read in the program may differ by this
+# [m, or as a rotation matrix] a frame that is stated and read in the program may differ by this
+AGREE = 5e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,19 +91,21 @@ def placed(fitted: Fitted, program: Program, frame: str, statements: Statements)
     refusals: list[str] = []
     notes: list[str] = []
 
-    tools: dict[str, str] = dict.fromkeys({setting.tool for setting in frames.settings}, statements.tool or "")
+    tool_names = {setting.tool for setting in frames.settings}
+    tools = dict.fromkeys(tool_names, statements.tool or "")
     if not measured:
         numbers = _completed(program, frames, "tool", _stated_tool(statements.tool, names), refusals)
         if flange.pose is None:
             refusals.append(f"{flange.name} is {flange.basis}")
-        named_poses = numbers.items() if flange.pose is not None else ()
-        for name, pose in named_poses:
-            tools[name] = _as_option(flange.pose @ pose)
-            notes.append(f"tool {name or 'active'}: {_in_words(pose)} in {flange}")
+        else:
+            for name, pose in numbers.items():
+                tools[name] = _as_option(flange.pose @ pose)
+                notes.append(f"tool {name or 'active'}: {_in_words(pose)} in {flange}")
     elif len(tools) > 1:
         refusals.append(f"--tool states one tool, the program has {listing(sorted(tools), 5)}: --frames FILE")
 
-    users = dict.fromkeys({setting.user for setting in frames.settings}, np.eye(4))
+    user_names = {setting.user for setting in frames.settings}
+    users = dict.fromkeys(user_names, np.eye(4))
     if in_station and statements.user is not None:
         refusals.append(f"--user-frame and --frame {frame} both say where the user frame is: state one of them")
     if in_station:
@@ -113,10 +114,10 @@ def placed(fitted: Fitted, program: Program, frame: str, statements: Statements)
         numbers = _completed(program, frames, "user", stated_frame(statements.user, "--user-frame"), refusals)
         if base.pose is None:
             refusals.append(f"{base.name} is {base.basis}")
-        named_poses = numbers.items() if base.pose is not None else ()
-        for name, pose in named_poses:
-            users[name] = base.pose @ pose
-            notes.append(f"user frame {name or 'active'}: {_in_words(pose)} in {base}")
+        else:
+            for name, pose in numbers.items():
+                users[name] = base.pose @ pose
+                notes.append(f"user frame {name or 'active'}: {_in_words(pose)} in {base}")
     if refusals:
         count = len(frames.settings)
         head = f"{program.path}: its {count} poses stand in frames that are not known; nothing was written"
@@ -145,22 +146,26 @@ def tool_in_tip(fitted: Fitted, controller: Controller, statements: Statements) 
 
 def _as_option(pose: np.ndarray) -> str:
     """Return a pose as ``x,y,z,roll,pitch,yaw`` [m, rad]."""
-    return ",".join(f"{value:.12g}" for value in np.hstack(to_xyz_rpy(pose)))
+    values = np.hstack(to_xyz_rpy(pose))
+    return ",".join(f"{value:.12g}" for value in values)
 
 
 def _grouped(
     program: Program, program_frames: ProgramFrames, tools: Mapping[str, str], users: Mapping[str, np.ndarray]
 ) -> tuple[Group, ...]:
     """Return the poses by tool and configuration, in the order in which these appear."""
-    poses, indices = program.poses(), program.of("pose")
+    settings = program_frames.settings
     members: dict[tuple[str, str], list[int]] = {}
-    for k, setting in enumerate(program_frames.settings):
-        members.setdefault((tools[setting.tool], setting.configuration), []).append(k)
+    for k, setting in enumerate(settings):
+        key = (tools[setting.tool], setting.configuration)
+        members.setdefault(key, []).append(k)
+    poses = program.poses()
+    target_indices = np.array(program.of("pose"))
     groups = []
     for (tool, configuration), rows in members.items():
-        frames = np.array([users[program_frames.settings[k].user] for k in rows])
-        group = Group(tuple(indices[k] for k in rows), tool, frames, frames @ poses[rows], configuration)
-        groups.append(group)
+        frames = np.array([users[settings[k].user] for k in rows])
+        indices = tuple(target_indices[rows].tolist())
+        groups.append(Group(indices, tool, frames, frames @ poses[rows], configuration))
     return tuple(groups)
 
 
@@ -186,52 +191,63 @@ def _completed(
         kind: ``tool`` or ``user``.
         statement: what the user says; it counts for the frame that has no numbers.
     """
-    option, label = ("--tool", "tool") if kind == "tool" else ("--user-frame", "user frame")
-    numbers = frames.tools if kind == "tool" else frames.users
+    if kind == "tool":
+        option, label, numbers = "--tool", "tool", frames.tools
+    else:
+        option, label, numbers = "--user-frame", "user frame", frames.users
+    # lines of the targets in each frame
     lines: dict[str, list[int]] = {}
     for index, setting in zip(program.of("pose"), frames.settings):
-        lines.setdefault(getattr(setting, kind), []).append(program.targets[index].line)
-    missing = [name for name in lines if name not in numbers]
-    result = {name: numbers[name] for name in lines if name in numbers}
+        name = setting.tool if kind == "tool" else setting.user
+        lines.setdefault(name, []).append(program.targets[index].line)
+    result: dict[str, np.ndarray] = {}
+    missing: list[str] = []
+    for name in lines:
+        if name in numbers:
+            result[name] = numbers[name]
+        else:
+            missing.append(name)
     if statement is not None and len(missing) == 1:
         return result | {missing[0]: statement}
     if statement is not None and missing:
         refusals.append(f"{option} states one {label}, {len(missing)} have no numbers: --frames FILE instead")
     elif statement is not None:
-        result |= _agreed(option, label, result, statement, refusals)
+        # no frame lacks numbers: the statement has to agree with those that were read
+        for name, pose in result.items():
+            if np.abs(pose - statement).max() > AGREE:
+                difference = f"{label} {name} is {_in_words(pose)} in the program's files"
+                refusals.append(f"{option} says {_in_words(statement)}, {difference}")
     for name in missing:
         location = f"line {listing(lines[name], 3)}"
-        subject = f"{label} {name}" if name else f"the {label} that is active"
-        refusals.append(f"{subject} ({location}) has no numbers here: {_ways(program, kind, option)}")
+        subject = f"the {label} that is active"
+        if name:
+            subject = f"{label} {name}"
+        refusals.append(f"{subject} ({location}) has no numbers here: {_advice(program, kind, option)}")
     return result
 
 
-def _agreed(
-    option: str, label: str, result: dict[str, np.ndarray], statement: np.ndarray, refusals: list[str]
-) -> dict[str, np.ndarray]:
-    """Return nothing new; refuse a statement that differs from the numbers that were read."""
-    for name, pose in result.items():
-        if np.abs(pose - statement).max() > AGREE:
-            difference = f"{label} {name} is {_in_words(pose)} in the program's files"
-            refusals.append(f"{option} says {_in_words(statement)}, {difference}")
-    return {}
-
-
-def _ways(program: Program, kind: str, option: str) -> str:
-    frame = program.controller.flange if kind == "tool" else program.controller.base
-    state = f"{option} x,y,z[,roll,pitch,yaw] [m, rad], in {frame}"
+def _advice(program: Program, kind: str, option: str) -> str:
+    """Return how the numbers of a tool or a user frame can be stated."""
+    frame = program.controller.base
+    if kind == "tool":
+        frame = program.controller.flange
+    advice = f"{option} x,y,z[,roll,pitch,yaw] [m, rad], in {frame}"
     files = LANGUAGES[program.controller.language].files
-    return f"{state}; or --frames FILE ({files})" if files else state
+    if files:
+        advice += f"; or --frames FILE ({files})"
+    return advice
 
 
 def _in_words(pose: np.ndarray) -> str:
     """Return a frame in millimetres and degrees."""
-    xyz, rpy = to_xyz_rpy(pose)
     if np.abs(pose - np.eye(4)).max() < 1e-12:
         return "zero"
-    length = ", ".join(f"{1e3 * value:.6g}" for value in xyz)
+    xyz, rpy = to_xyz_rpy(pose)
+    position = ", ".join(f"{1e3 * value:.6g}" for value in xyz)
+    if np.abs(rpy).max() < 1e-12:
+        return f"{position} mm"
     turn = ", ".join(f"{value:.6g}" for value in np.degrees(rpy))
-    return f"{length} mm" + ("" if np.abs(rpy).max() < 1e-12 else f", roll, pitch, yaw {turn}°")
+    return f"{position} mm, roll, pitch, yaw {turn}°"
 
 
 def user_poses(group: Group, poses: np.ndarray) -> np.ndarray:

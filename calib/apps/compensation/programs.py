@@ -1,16 +1,13 @@
 """Compensation inside a controller's program: ``calib compensate FIT PROGRAM.src --out SENT.src``.
 
 The targets in a program (`calib.apps.controller_programs.targets`) are replaced by ones that bring the real tool to
-where
-they are meant; every other byte stays. A joint target becomes the joint command. A pose becomes the pose that the
+where they are meant; every other byte stays. A joint target becomes the joint command. A pose becomes the pose that the
 nominal robot, the controller's own model, has at the joint command.
 
 Tool and user frame of a pose are read from the program (`calib.apps.controller_programs.languages`), or stated:
-``--tool``,
-``--user-frame``, ``--frames`` with a file of the controller; else the program is refused. Elbow, wrist and turns are
-those of its configuration (`calib.apps.controller_programs.configurations`); where it says none, of the solution
-nearest to
-``--start``.
+``--tool``, ``--user-frame``, ``--frames`` with a file of the controller; else the program is refused. Elbow, wrist and
+turns are those of its configuration (`calib.apps.controller_programs.configurations`); where it says none, of the
+solution nearest to ``--start``.
 """
 
 from collections.abc import Sequence
@@ -67,8 +64,9 @@ class CompensatedProgram:
         """The new numbers of each target in the controller's units; None for a target that is not reached."""
         values: list[np.ndarray | None] = [None] * len(self.program.targets)
         for part in self.parts:
-            for index, row, reached in zip(part.indices, part.values, part.commands.reached):
-                values[index] = row if reached else None
+            for index, numbers, reached in zip(part.indices, part.values, part.commands.reached):
+                if reached:
+                    values[index] = numbers
         return values
 
     @property
@@ -77,9 +75,11 @@ class CompensatedProgram:
         reasons = {}
         for part in self.parts:
             reasons |= dict(zip(part.indices, part.commands.reason))
-        targets = self.program.targets
-        missed = [k for k, value in enumerate(self.values) if value is None]
-        return [f"line {targets[k].line}: {reasons[k]}" for k in missed]
+        lost = []
+        for k, (target, value) in enumerate(zip(self.program.targets, self.values)):
+            if value is None:
+                lost.append(f"line {target.line}: {reasons[k]}")
+        return lost
 
     def lines(self) -> list[str]:
         """Return the lines for the user."""
@@ -88,8 +88,12 @@ class CompensatedProgram:
             notes += part.notes
             if part.commands.reached.any():
                 notes += [line for line in lines(part.commands) if not line.startswith("not reached")]
-        missed = ["not reached, left as it was: " + reason for reason in self.lost]
-        return [*dict.fromkeys(notes), *missed, *filter(None, [self.program.unread])]
+        # a note that several parts have is said once
+        result = list(dict.fromkeys(notes))
+        result += [f"not reached, left as it was: {reason}" for reason in self.lost]
+        if self.program.unread:
+            result.append(self.program.unread)
+        return result
 
     def write(self, out: Path, partial: bool) -> Path:
         """Write the program with its new targets.
@@ -97,11 +101,14 @@ class CompensatedProgram:
         Raises:
             UsageError: where a target is not reached and `partial` does not allow that; nothing is written.
         """
-        lost, path = self.lost, self.program.path
-        if lost and (not partial or len(lost) == len(self.values)):
-            head = f"{path}: {len(lost)} of {len(self.values)} targets are not reached; nothing was written"
-            advice = "" if len(lost) == len(self.values) else "\nwith --partial, these stay as they are"
-            raise UsageError("\n  ".join([head, *lost]) + advice)
+        lost = self.lost
+        count = len(self.values)
+        if lost and (not partial or len(lost) == count):
+            head = f"{self.program.path}: {len(lost)} of {count} targets are not reached; nothing was written"
+            message = "\n  ".join([head, *lost])
+            if len(lost) != count:
+                message += "\nwith --partial, these stay as they are"
+            raise UsageError(message)
         return files.write(out, self.program.rewritten(self.values))
 
 
@@ -145,7 +152,8 @@ def compensated(
     parts = []
     if joints:
         targets = Targets(program.joints(), file=str(program.path))
-        commands = computed(fitted, targets, tool=tool_in_tip(fitted, program.controller, statements), **options)
+        tool = tool_in_tip(fitted, program.controller, statements)
+        commands = computed(fitted, targets, tool=tool, **options)
         parts.append(Part(tuple(joints), commands, program.controller.shown(commands.q)))
     parts += [_compensated_group(fitted, program, group, start, options) for group in groups]
     return CompensatedProgram(program, tuple(parts), notes)
@@ -156,7 +164,10 @@ def _check_postures(fitted: Fitted, program: Program, groups: Sequence[Group], s
     if start is not None:
         return
     spherical = has_spherical_wrist(fitted.nominal.chain)
-    silent = [index for group in groups if not (group.configuration and spherical) for index in group.indices]
+    silent: list[int] = []
+    for group in groups:
+        if not group.configuration or not spherical:
+            silent += group.indices
     if silent:
         location = f"{len(silent)} targets (the first in line {program.targets[min(silent)].line})"
         cause = "the program does not say elbow or wrist"
@@ -171,32 +182,38 @@ def _compensated_group(
     fitted: Fitted, program: Program, group: Group, start: Sequence[float] | None, options: FieldValues
 ) -> Part:
     """Return the commands of poses with one tool and configuration."""
-    kind, frame, seed = program.controller, options["frame"], options["seed"]
-    model = placements(fitted, frame, group.tool)[0]
+    controller = program.controller
+    model, _ = placements(fitted, options["frame"], group.tool)
     chain = model.chain
-    configuration = configuration_of(kind, group.configuration) if has_spherical_wrist(chain) else None
+    configuration = None
+    if has_spherical_wrist(chain):
+        configuration = configuration_of(controller, group.configuration)
     targets = replace(Targets.of(group.poses), file=str(program.path))
+    notes = ()
     if configuration is None:
-        commands, notes = computed(fitted, targets, tool=group.tool, start=start, **options), ()
+        commands = computed(fitted, targets, tool=group.tool, start=start, **options)
     else:
         goal = Goal(model, 6, chain.lower, chain.upper)
-        sought = postures(goal, group.poses, configuration, kind, start, seed)
-        commands = computed(fitted, replace(targets, q=sought.q), tool=group.tool, **options)
+        sought = postures(goal, group.poses, configuration, controller, start, options["seed"])
+        targets = replace(targets, q=sought.q)
+        commands = computed(fitted, targets, tool=group.tool, **options)
         if start is None:
             commands = _without(commands, sought.reasons)
         notes = _posture_notes(program, group, configuration, commands, sought)
-    values = pose_values(kind, user_poses(group, see(model, commands.q).poses()))
+    nominal_poses = see(model, commands.q).poses()
+    values = pose_values(controller, user_poses(group, nominal_poses))
     return Part(group.indices, commands, values, notes)
 
 
 def _without(commands: Commands, reasons: Sequence[str]) -> Commands:
     """Return commands of which those with a reason are not reached, for that reason."""
-    good = np.array([not reason for reason in reasons])
-    merged = tuple(
-        f"{reason}; --start takes the posture nearest to it" if reason else former
-        for reason, former in zip(reasons, commands.reason)
-    )
-    return replace(commands, reached=commands.reached & good, reason=merged)
+    reached = commands.reached.copy()
+    command_reasons = list(commands.reason)
+    for k, reason in enumerate(reasons):
+        if reason:
+            reached[k] = False
+            command_reasons[k] = f"{reason}; --start takes the posture nearest to it"
+    return replace(commands, reached=reached, reason=tuple(command_reasons))
 
 
 def _posture_notes(
@@ -206,9 +223,10 @@ def _posture_notes(
     notes = []
     reached = commands.reached
     lines = np.array([program.targets[index].line for index in group.indices])
-    unfit = np.array([bool(reason) for reason in sought.reasons])
-    outcome = "the posture nearest to --start is taken"
-    notes += [f"warning: line {lines[k]}: {sought.reasons[k]}; {outcome}" for k in np.flatnonzero(reached & unfit)]
+    unfit = np.array(sought.reasons) != ""
+    for k in np.flatnonzero(reached & unfit):
+        outcome = "the posture nearest to --start is taken"
+        notes.append(f"warning: line {lines[k]}: {sought.reasons[k]}; {outcome}")
     against = lines[reached & sought.contradicted & ~unfit]
     if len(against):
         message = f"the posture nearest to --start is not that of {configuration.text}, which is followed"

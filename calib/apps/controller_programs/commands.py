@@ -39,7 +39,7 @@ def program(
     from calib.apps.controller_programs.program import program_files
     from calib.apps.controller_programs.targets import is_program, read_program
     from calib.controllers.table import controllers
-    from calib.errors import UsageError, require
+    from calib.errors import UsageError
 
     if listed:
         for name, row in controllers().items():
@@ -47,17 +47,23 @@ def program(
             say(f"{name}: {row.title}, {file_names}", result=True)
             say(f"    takes: {row.takes}", f"    closed: {row.closed}", f"    checked by: {row.checked}", result=True)
         return
-    names = ", ".join((*controllers(), CSV))
-    require(poses is not None and controller, f"give a list of poses and its controller: --for {names}", UsageError)
-    assert poses is not None
+    if poses is None or not controller:
+        names = ", ".join((*controllers(), CSV))
+        raise UsageError(f"give a list of poses and its controller: --for {names}")
     poses = motion_file(poses)
-    beside = poses.with_suffix(".csv") if controller == CSV else poses.with_name(poses.name.partition(".")[0])
-    target = out or beside
-    texts = program_files(poses, target, controller, settings, source)
-    if (source or is_program(poses)) and (warning := read_program(poses, source).unread):
-        say(warning)
+    # by default beside the poses
+    if out is None and controller == CSV:
+        out = poses.with_suffix(".csv")
+    elif out is None:
+        out = poses.with_name(poses.name.partition(".")[0])
+    texts = program_files(poses, out, controller, settings, source)
+    if source or is_program(poses):
+        warning = read_program(poses, source).unread
+        if warning:
+            say(warning)
     with files.results([(path, ()) for path in texts], [poses], overwrite):
-        say(*(f"written to {files.write(path, text)}" for path, text in texts.items()))
+        written = [files.write(path, text) for path, text in texts.items()]
+        say(*(f"written to {path}" for path in written))
 
 
 @command(app, "Geometry")

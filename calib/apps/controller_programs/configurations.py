@@ -29,17 +29,33 @@ from calib.geometry.inverse import Goal
 from calib.robot.chain import AXES, Chain
 from calib.robot.kinematics import joint_frames
 
-CLEAR = (0.01, 0.001)  # [m], [m²] the upright posture is clearly before axis 1, and its elbow clearly bent
-SLACK = np.radians(0.5)  # [rad] an angle that is rounded onto a boundary is on both sides of it
-TRIES = 4000  # random postures among which starts in the configuration are looked for
-STARTS = 24  # starts for each configuration, in its branch, and as many again where a pose has no posture yet
-ROUNDS = 3  # times that this many starts are tried
-STRAY = 6  # starts in any branch: what else reaches the pose is said where the configuration does not
-MET = (1e-6, 1e-5)  # [m], [rad] a posture that leaves less reaches its pose
-MEETING = 2e-3  # [m] axes that pass each other closer than this meet
-SAME = 1e-3  # [rad] postures that differ by less are one
+# [m], [m²] the upright posture is clearly before axis 1, and its elbow clearly bent
+CLEAR = (0.01, 0.001)
+# [rad] an angle that is rounded onto a boundary is on both sides of it
+SLACK = np.radians(0.5)
+# random postures among which starts in the configuration are looked for
+TRIES = 4000
+# starts for each configuration, in its branch, and as many again where a pose has no posture yet
+STARTS = 24
+# times that this many starts are tried
+ROUNDS = 3
+# starts in any branch: what else reaches the pose is said where the configuration does not
+STRAY = 6
+# [m], [rad] a posture that leaves less reaches its pose
+MAX_POSITION_ERROR, MAX_TURN_ERROR = 1e-6, 1e-5
+# [m] axes that pass each other closer than this meet
+MEETING = 2e-3
+# [rad] postures that differ by less are one
+SAME = 1e-3
 TURN = 2.0 * np.pi
-WRAPS = (-2, -1, 0, 1, 2)  # whole turns of a joint that are tried
+# whole turns of a joint that are tried
+WRAPS = (-2, -1, 0, 1, 2)
+# of wrist centre, elbow and axis 5: in words where the sign is positive, and negative
+SIGN_LABELS = (
+    ("before axis 1", "behind axis 1"),
+    ("elbow as upright", "elbow bent back"),
+    ("axis 5 > 0", "axis 5 < 0"),
+)
 
 
 @dataclass(frozen=True)
@@ -66,33 +82,40 @@ class Configuration:
 
     def agrees(self, chain: Chain, q: np.ndarray) -> np.ndarray:
         """Return which of some postures (m, n) [rad] have the signs that are said (m,); turns are not looked at."""
-        stood, signs = signs_at(chain, q, np.array(self.upright)), np.array(self.signs())
-        return np.all((signs == 0) | (stood == 0) | (stood == signs), axis=1)
+        posture_signs = signs_at(chain, q, np.array(self.upright))
+        required = np.array(self.signs())
+        undecided = (required == 0) | (posture_signs == 0)
+        return np.all(undecided | (posture_signs == required), axis=1)
 
     def wrapped(self, controller: Controller, goal: Goal, q: np.ndarray, reference: np.ndarray) -> np.ndarray:
-        """Return postures (m, n) with whole turns added: within limits and ranges, and else nearest to `near`.
+        """Return postures (m, n) with whole turns added: within limits and ranges, and else nearest to `reference`.
 
         A posture that no turns bring into the ranges is NaN.
         """
-        lower, upper = np.broadcast_to(goal.lower, q.shape), np.broadcast_to(goal.upper, q.shape)
+        lower = np.broadcast_to(goal.lower, q.shape)
+        upper = np.broadcast_to(goal.upper, q.shape)
         best = np.full(q.shape, np.nan)
         for joint in range(q.shape[1]):
             smallest, largest = self.ranges.get(joint, (-np.inf, np.inf))
+            low = np.maximum(lower[:, joint] - 1e-9, smallest - SLACK)
+            high = np.minimum(upper[:, joint] + 1e-9, largest + SLACK)
+            turning = goal.cell.chain.joints[joint].kind == "revolute"
             cost = np.full(len(q), np.inf)
-            for turns in WRAPS if goal.cell.chain.joints[joint].kind == "revolute" else (0,):
+            for turns in WRAPS if turning else (0,):
                 angle = q[:, joint] + TURN * turns
-                allowed = (angle >= lower[:, joint] - 1e-9) & (angle <= upper[:, joint] + 1e-9)
-                allowed &= (angle >= smallest - SLACK) & (angle <= largest + SLACK)
+                allowed = (angle >= low) & (angle <= high)
                 away = np.where(allowed, np.abs(angle - reference[joint]), np.inf)
                 closer = away < cost
-                best[closer, joint], cost[closer] = angle[closer], away[closer]
+                best[closer, joint] = angle[closer]
+                cost[closer] = away[closer]
         return best
 
     def holds(self, controller: Controller, chain: Chain, q: np.ndarray) -> np.ndarray:
         """Return which postures (m, n) [rad] have the signs and the turns that are said (m,)."""
         allowed = self.agrees(chain, q)
         for joint, (smallest, largest) in self.ranges.items():
-            allowed &= (q[:, joint] >= smallest - SLACK) & (q[:, joint] <= largest + SLACK)
+            angle = q[:, joint]
+            allowed &= (angle >= smallest - SLACK) & (angle <= largest + SLACK)
         return allowed
 
 
@@ -100,13 +123,13 @@ def has_spherical_wrist(chain: Chain) -> bool:
     """Return whether an arm has six turning joints whose last three axes meet: the arms that configurations are of."""
     if chain.n != 6 or any(joint.kind != "revolute" for joint in chain.joints):
         return False
-    frames = joint_frames(chain, np.zeros((1, 6)))
-    points = frames[:, :, :3, 3]
-    axes = np.stack([_direction(chain, frames, joint) for joint in range(6)])
+    points, axes = _axes(chain, np.zeros((1, 6)))
     by_4 = _nearest_point(points[4], axes[4], points[3], axes[3])
     by_6 = _nearest_point(points[4], axes[4], points[5], axes[5])
-    beside = np.cross(by_4 - points[3], axes[3]), np.cross(by_6 - points[5], axes[5]), by_4 - by_6
-    return max(float(np.abs(distance).max()) for distance in beside) < MEETING
+    from_axis_4 = np.cross(by_4 - points[3], axes[3])
+    from_axis_6 = np.cross(by_6 - points[5], axes[5])
+    distances = np.abs([from_axis_4, from_axis_6, by_4 - by_6])
+    return float(distances.max()) < MEETING
 
 
 def configuration_of(controller: Controller, text: str) -> Configuration | None:
@@ -114,15 +137,23 @@ def configuration_of(controller: Controller, text: str) -> Configuration | None:
     none."""
     readers = {"tp": _tp, "krl": _krl, "rapid": _rapid}
     reader = readers.get(controller.language)
-    return reader(text.split(), controller) if reader and text else None
+    if reader is None or not text:
+        return None
+    return reader(text.split(), controller)
 
 
 def _tp(fields: Sequence[str], controller: Controller) -> Configuration:
-    letters = {entry.upper() for entry in fields if entry.isalpha()}
-    turns = [int(entry) for entry in fields if not entry.isalpha()]
+    letters, turns = set[str](), list[int]()
+    for entry in fields:
+        if entry.isalpha():
+            letters.add(entry.upper())
+        else:
+            turns.append(int(entry))
     before = _sign_of(letters, "T", "B")
-    # behind axis 1 it is not known which elbow U and D mean
-    elbow = 0 if before < 0 else _sign_of(letters, "U", "D")
+    elbow = _sign_of(letters, "U", "D")
+    if before < 0:
+        # behind axis 1 it is not known which elbow U and D mean
+        elbow = 0
     wrist = -_sign_of(letters, "N", "F")
     ranges = {0: (-np.pi, np.pi)}
     for joint, turn in zip((3, 4, 5), turns):
@@ -134,24 +165,35 @@ def _sign_of(letters: set[str], positive: str, negative: str) -> int:
     """Return +1 or -1 by the letter that is among the letters; 0 where neither is."""
     if positive in letters:
         return 1
-    return -1 if negative in letters else 0
+    if negative in letters:
+        return -1
+    return 0
 
 
 def _krl(fields: Sequence[str], controller: Controller) -> Configuration:
     status, turn = int(fields[1]), int(fields[3])
-    signs = [-1 if status & 1 else 1, 1 if status & 2 else -1, -1 if status & 4 else 1]
-    ranges = {k: (-np.inf, 0.0) if turn >> k & 1 else (0.0, np.inf) for k in range(6)}
+    before = -1 if status & 1 else 1
+    elbow = 1 if status & 2 else -1
+    wrist = -1 if status & 4 else 1
+    ranges = {}
+    for joint in range(6):
+        negative = turn >> joint & 1
+        ranges[joint] = (-np.inf, 0.0) if negative else (0.0, np.inf)
     home = (0.0, -np.pi / 2, np.pi / 2, 0.0, 0.0, 0.0)
-    return Configuration(" ".join(fields), signs[0], signs[1], signs[2], ranges, home)
+    return Configuration(" ".join(fields), before, elbow, wrist, ranges, home)
 
 
 def _rapid(fields: Sequence[str], controller: Controller) -> Configuration:
-    quarters = [int(entry) for entry in fields]
-    ranges = {k: (np.pi / 2 * q, np.pi / 2 * (q + 1)) for k, q in zip((0, 3, 5), quarters)}
-    by_cfx = 0 if controller.coupled else 1
-    cfx = quarters[3]
-    signs = [by_cfx * (-1 if cfx & bit else 1) for bit in (4, 2, 1)]
-    return Configuration(f"confdata [{', '.join(fields)}]", signs[0], signs[1], signs[2], ranges)
+    quarter_1, quarter_4, quarter_6, cfx = map(int, fields)
+    ranges = {}
+    for joint, quarter in ((0, quarter_1), (3, quarter_4), (5, quarter_6)):
+        ranges[joint] = (np.pi / 2 * quarter, np.pi / 2 * (quarter + 1))
+    before = elbow = wrist = 0
+    if not controller.coupled:
+        before = -1 if cfx & 4 else 1
+        elbow = -1 if cfx & 2 else 1
+        wrist = -1 if cfx & 1 else 1
+    return Configuration(f"confdata [{', '.join(fields)}]", before, elbow, wrist, ranges)
 
 
 def signs_at(chain: Chain, q: np.ndarray, upright: np.ndarray) -> np.ndarray:
@@ -162,29 +204,37 @@ def signs_at(chain: Chain, q: np.ndarray, upright: np.ndarray) -> np.ndarray:
     Args:
         upright: (6,) posture whose wrist centre and elbow are +1.
     """
-    raw = _distances(chain, np.vstack([upright, q]))
-    reference = np.where(np.abs(raw[0]) > CLEAR, np.sign(raw[0]), 0.0)
-    signs = np.sign(raw[1:]) * reference
-    turned = np.sign(np.where(np.abs(q[:, 4]) < SLACK, 0.0, np.sin(q[:, 4])))
-    return np.column_stack([signs, turned])
+    distances = _distances(chain, np.vstack([upright, q]))
+    upright_distances = distances[0]
+    is_clear = np.abs(upright_distances) > CLEAR
+    reference = np.where(is_clear, np.sign(upright_distances), 0.0)
+    signs = np.sign(distances[1:]) * reference
+    wrist = np.sign(np.sin(q[:, 4]))
+    wrist = np.where(np.abs(q[:, 4]) < SLACK, 0.0, wrist)
+    return np.column_stack([signs, wrist])
 
 
 def _distances(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return how far (m, 2) the wrist centre is before axis 1, and beside the line from axis 2 to axis 3 (times its
     length); with a sign of its own for each arm."""
-    frames = joint_frames(chain, q)
-    points = frames[:, :, :3, 3]
-    axes = np.stack([_direction(chain, frames, joint) for joint in range(6)])
+    points, axes = _axes(chain, q)
     wrist = _nearest_point(points[4], axes[4], points[3], axes[3])
     ahead = np.cross(axes[1], axes[0])
     before = np.einsum("mi,mi->m", wrist - points[0], ahead)
-    beside = np.einsum("mi,mi->m", np.cross(points[2] - points[1], wrist - points[2]), axes[1])
+    upper_arm, forearm = points[2] - points[1], wrist - points[2]
+    beside = np.einsum("mi,mi->m", np.cross(upper_arm, forearm), axes[1])
     return np.column_stack([before, beside])
 
 
-def _direction(chain: Chain, frames: np.ndarray, joint: int) -> np.ndarray:
-    element = chain.elements[int(chain.moving[joint])]
-    return element.sign * frames[joint, :, :3, AXES.index(element.axis) % 3]
+def _axes(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a point of each joint's axis, and its direction, at postures (m, n): both (n, m, 3)."""
+    frames = joint_frames(chain, q)
+    directions = []
+    for joint, element_index in enumerate(chain.moving):
+        element = chain.elements[int(element_index)]
+        column = AXES.index(element.axis) % 3
+        directions.append(element.sign * frames[joint, :, :3, column])
+    return frames[:, :, :3, 3], np.stack(directions)
 
 
 def _nearest_point(point: np.ndarray, axis: np.ndarray, second: np.ndarray, across: np.ndarray) -> np.ndarray:
@@ -192,7 +242,8 @@ def _nearest_point(point: np.ndarray, axis: np.ndarray, second: np.ndarray, acro
     between = second - point
     slope = np.einsum("mi,mi->m", axis, across)
     along = np.einsum("mi,mi->m", between, axis) - slope * np.einsum("mi,mi->m", between, across)
-    return point + (along / np.maximum(1.0 - slope**2, 1e-12))[:, None] * axis
+    distance = along / np.maximum(1.0 - slope**2, 1e-12)
+    return point + distance[:, None] * axis
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,38 +284,52 @@ def postures(
     """
     chain = goal.cell.chain
     lower, upper = chain.sampling_limits()
-    middle = np.clip(np.zeros(chain.n), lower, upper) if start is None else np.asarray(start, float)
+    if start is None:
+        middle = np.clip(np.zeros(chain.n), lower, upper)
+    else:
+        middle = np.asarray(start, float)
     drawn = np.random.default_rng(seed).uniform(lower, upper, (TRIES, chain.n))
-    fitting = drawn[configuration.agrees(chain, drawn)]
-    solutions = [np.empty((0, chain.n)) for _ in poses]
+    in_configuration = drawn[configuration.agrees(chain, drawn)]
+
+    # all postures that reach each pose; more starts are tried where none of them has the configuration
+    solutions = [np.empty((0, chain.n))] * len(poses)
     waiting = np.arange(len(poses))
     for k in range(ROUNDS):
-        firsts = fitting[k * STARTS : (k + 1) * STARTS]
+        starts = in_configuration[k * STARTS : (k + 1) * STARTS]
         if k == 0:
-            firsts = np.vstack([middle, firsts, drawn[:STRAY]])
-        goals = np.repeat(poses[waiting], len(firsts), axis=0)
-        q = inverse.reach(goal, goals, np.tile(firsts, (len(waiting), 1)))
+            starts = np.vstack([middle, starts, drawn[:STRAY]])
+        goals = np.repeat(poses[waiting], len(starts), axis=0)
+        all_starts = np.tile(starts, (len(waiting), 1))
+        q = inverse.reach(goal, goals, all_starts)
         met = _met(goal, q, goals).reshape(len(waiting), -1)
-        q = q.reshape(len(waiting), len(firsts), -1)
-        for index, row, reached in zip(waiting, q, met):
-            solutions[index] = np.vstack([solutions[index], row[reached]])
-        agreed = [len(_agreeing(goal, configuration, controller, solutions[index], middle)) for index in waiting]
-        waiting = waiting[np.array(agreed, int) == 0]
+        q = q.reshape(len(waiting), len(starts), -1)
+        without = []
+        for index, reached, is_met in zip(waiting, q, met):
+            solutions[index] = np.vstack([solutions[index], reached[is_met]])
+            if not len(_agreeing(goal, configuration, controller, solutions[index], middle)):
+                without.append(index)
+        waiting = np.array(without, int)
         if not len(waiting):
             break
-    chosen, reasons = np.tile(middle, (len(poses), 1)), []
+
+    chosen = np.tile(middle, (len(poses), 1))
     contradicted = np.zeros(len(poses), bool)
+    reasons = []
     for k, reached in enumerate(solutions):
         if not len(reached):
             reasons.append("")
             continue
-        agreeing = _agreeing(goal, configuration, controller, reached, middle)
+        # the nearest in any configuration, and the nearest in this one
         nearby = Configuration("").wrapped(controller, goal, reached, middle)
-        nearest = nearby[np.argmin(np.nan_to_num(np.abs(nearby - middle), nan=np.inf).max(axis=1))]
+        distance = np.abs(nearby - middle)
+        nearest = nearby[np.argmin(np.nan_to_num(distance, nan=np.inf).max(axis=1))]
         chosen[k] = nearest
+        agreeing = _agreeing(goal, configuration, controller, reached, middle)
         if len(agreeing):
-            chosen[k] = agreeing[np.argmin(np.abs(agreeing - middle).max(axis=1))]
-        contradicted[k] = start is not None and not configuration.holds(controller, chain, nearest[None])[0]
+            distance = np.abs(agreeing - middle).max(axis=1)
+            chosen[k] = agreeing[np.argmin(distance)]
+        if start is not None:
+            contradicted[k] = not configuration.holds(controller, chain, nearest[None])[0]
         reasons.append(_objection(chain, configuration, reached, agreeing, start is not None))
     return Postures(chosen, tuple(reasons), contradicted)
 
@@ -273,8 +338,8 @@ def _agreeing(
     goal: Goal, configuration: Configuration, controller: Controller, reached: np.ndarray, reference: np.ndarray
 ) -> np.ndarray:
     """Return the distinct postures of some (k, n) that have a configuration, whole turns added as it says."""
-    fitting = reached[configuration.agrees(goal.cell.chain, reached)]
-    wrapped = configuration.wrapped(controller, goal, fitting, reference)
+    in_configuration = reached[configuration.agrees(goal.cell.chain, reached)]
+    wrapped = configuration.wrapped(controller, goal, in_configuration, reference)
     wrapped = wrapped[np.isfinite(wrapped).all(axis=1)]
     distinct: list[np.ndarray] = []
     for q in wrapped:
@@ -290,23 +355,29 @@ def _objection(
     if not len(agreeing) and configuration.agrees(chain, reached).any():
         return f"{configuration.text} has no posture at this pose: none within the joints' limits has its turns"
     if not len(agreeing):
-        signs = np.unique(signs_at(chain, reached, np.array(configuration.upright)), axis=0)
-        stood = "; ".join(", ".join(_sign_labels(row)) for row in signs)
-        required = ", ".join(_sign_labels(np.array(configuration.signs()))) or "turns only"
-        return f"{configuration.text} ({required}) is no posture at this pose; the arm reaches it with {stood}"
+        signs = signs_at(chain, reached, np.array(configuration.upright))
+        alternatives = "; ".join(_sign_text(row) for row in np.unique(signs, axis=0))
+        required = _sign_text(np.array(configuration.signs())) or "turns only"
+        return f"{configuration.text} ({required}) is no posture at this pose; the arm reaches it with {alternatives}"
     if len(agreeing) > 1 and not started:
         return f"{configuration.text} leaves {len(agreeing)} postures"
     return ""
 
 
-def _sign_labels(signs: np.ndarray) -> list[str]:
+def _sign_text(signs: np.ndarray) -> str:
     """Return signs of wrist centre, elbow and axis 5 in words; nothing for 0."""
-    labels = (("before axis 1", "behind axis 1"), ("elbow as upright", "elbow bent back"), ("axis 5 > 0", "axis 5 < 0"))
-    return [pair[0 if sign > 0 else 1] for sign, pair in zip(signs, labels) if sign]
+    labels = []
+    for sign, (positive, negative) in zip(signs, SIGN_LABELS):
+        if sign > 0:
+            labels.append(positive)
+        elif sign < 0:
+            labels.append(negative)
+    return ", ".join(labels)
 
 
 def _met(goal: Goal, q: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """Return which postures (m, n) reach their poses (m,)."""
     difference = inverse.differences(goal, q, poses)
-    position = np.linalg.norm(difference[:, :3], axis=1) <= MET[0]
-    return position & (np.linalg.norm(difference[:, 3:], axis=1) <= MET[1])
+    position_error = np.linalg.norm(difference[:, :3], axis=1)
+    turn_error = np.linalg.norm(difference[:, 3:], axis=1)
+    return (position_error <= MAX_POSITION_ERROR) & (turn_error <= MAX_TURN_ERROR)

@@ -5,8 +5,7 @@ meets the measurements best. One whose axes are mastered anew takes joint offset
 from a fit with ``--model offsets``, since offsets of a richer model are not the best ones by themselves.
 
 Each frame stands in the controller's base or flange (`calib.apps.controller_programs.frames`), and is printed with it.
-Where
-nothing says where that is, no number is printed.
+Where nothing says where that is, no number is printed.
 """
 
 from collections.abc import Iterator
@@ -21,10 +20,11 @@ from calib.geometry.installation import Installation, read_arms
 from calib.procedure.export.delivery import fit_verdicts
 from calib.procedure.export.geometry import read
 from calib.robot.calibrated import CalibratedChain, nominal_of
-from calib.toolkit.opened_results import open_result
+from calib.toolkit.result_folders import open_result
 from calib.transforms import invert
 
-DECIMALS = {"m": 7, "mm": 4}  # of frames, by the unit of lengths
+# of frames, by the unit of lengths
+DECIMALS = {"m": 7, "mm": 4}
 
 
 def delivery_text(
@@ -41,9 +41,12 @@ def delivery_text(
     Raises:
         UsageError: for a folder without a fit.
     """
-    fit_folder = open_result(folder, "deliver").fit("deliver")
+    result = open_result(folder, "deliver")
+    result.check_arm("deliver")
+    fit_folder = result.fit
     fit = folder if fit_folder is None else fit_folder.path
-    robot, (cell, nominal) = read(fit, "deliver"), read_arms(fit)
+    robot = read(fit, "deliver")
+    cell, nominal = read_arms(fit)
     arm = Description.of_fit(fit, nominal.chain)
     frames = base_frame(controller, arm, world), flange_frame(controller, arm, flange)
     lines = [f"{controller.title}: calibration of {robot.chain.name}", str(fit_verdicts(fit)), ""]
@@ -64,7 +67,10 @@ def delivery_text(
         ]
     else:
         lines.append("Mastering offsets: fit with --model offsets, and deliver that fit.")
-    lines += ["", *(f"Warning: {frame.warning}." for frame in frames if frame.warning)]
+    lines.append("")
+    for frame in frames:
+        if frame.warning:
+            lines.append(f"Warning: {frame.warning}.")
     lines.append(f"{controller.base}, {controller.flange}: {controller.frames}.")
     lines.append("A tool's angles are nominal where only its position was measured.")
     return "\n".join([*lines, ""])
@@ -90,14 +96,18 @@ def _stood(
 
 
 def _written(form: str, controller: Controller, pose: np.ndarray, index: int) -> str:
-    values = (number(value, DECIMALS[controller.length]) for value in pose_values(controller, pose[None])[0])
-    return form.format(*values, n=index)
+    (values,) = pose_values(controller, pose[None])
+    numbers = [number(value, DECIMALS[controller.length]) for value in values]
+    return form.format(*numbers, n=index)
 
 
 def _mastering(robot: CalibratedChain, controller: Controller) -> Iterator[str]:
     """Yield the offset of each axis in the controller's unit, to add to what it shows."""
-    chain, before = robot.chain, nominal_of(robot)
-    offsets = [(chain.elements[k].value - before.elements[k].value) / chain.elements[k].ratio for k in chain.moving]
+    chain, nominal = robot.chain, nominal_of(robot)
+    offsets = []
+    for k in chain.moving:
+        change = chain.elements[k].value - nominal.elements[k].value
+        offsets.append(change / chain.elements[k].ratio)
     for axis, value in enumerate(controller.shown(np.array(offsets)), 1):
         note = "" if value else " (kept at nominal)"
         yield f"  axis {axis}: true angle = shown angle {value:+.5f} {controller.unit}{note}"

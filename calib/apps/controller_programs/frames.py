@@ -28,9 +28,14 @@ from calib.robot.kinematics import forward, joint_frames
 from calib.transforms import from_xyz_rpy, invert, rotation_vector, to_xyz_rpy
 from calib.units import plain_number
 
-SAME = 1e-3  # [m or rad] two frames that differ by less are one: descriptions are rounded to that
-FARTHEST = 20.0  # [m] no controller's base or tool stands farther off: such numbers are millimetres
-STRAIGHT = 0.02  # [rad] between a tool frame's z and the last axis, between axis 1 and base_link's z
+# [m or rad] two frames that differ by less are one: descriptions are rounded to that
+SAME = 1e-3
+# [m] no controller's base or tool stands farther off: such numbers are millimetres
+FARTHEST = 20.0
+# [rad] between a tool frame's z and the last axis, between axis 1 and base_link's z
+STRAIGHT = 0.02
+NO_SHIFT = [0.0, 0.0, 0.0]
+NO_TURN = [0.0, 0.0, 0.0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +69,18 @@ class Description:
     def of_fit(cls, folder: Path, chain: Chain) -> Self:
         """Return the description of a fit's nominal arm; its URDF keeps the links of the URDF that was fitted."""
         path = FitFolder(folder).urdf
-        return cls(chain, read_tree(text(path)[0], str(path)) if path.is_file() else None)
+        if not path.is_file():
+            return cls(chain)
+        xml, *_ = text(path)
+        return cls(chain, read_tree(xml, str(path)))
 
     @property
     def prefix(self) -> str:
         """What stands before the names of the arm's links, as ``left_``."""
-        names = [self.chain.base, self.chain.tip, *(self._links_at_base() if self.tree else [])]
+        names = [self.chain.base, self.chain.tip]
+        if self.tree is not None:
+            root, _ = _fixed_to(self.tree, self.chain.base)
+            names += [name for name, _ in self.tree.rigid(root)]
         for name in names:
             for standard in ("base_link", "tool0"):
                 if name.endswith(standard):
@@ -78,7 +89,9 @@ class Description:
 
     def has(self, link: str) -> bool:
         """Return whether there is such a link."""
-        return link in self.tree.bodies if self.tree else link in (self.chain.base, self.chain.tip)
+        if self.tree is None:
+            return link in (self.chain.base, self.chain.tip)
+        return link in self.tree.bodies
 
     def pose(self, link: str, start: str) -> np.ndarray | None:
         """Return the pose (4, 4) of a link in another one; None where joints between them move.
@@ -90,18 +103,20 @@ class Description:
             return np.eye(4)
         if self.tree is None:
             return None
-        (first, placed), (second, begun) = (_fixed_to(self.tree, name) for name in (link, start))
-        return invert(begun) @ placed if first == second else None
+        root, pose = _fixed_to(self.tree, link)
+        start_root, start_pose = _fixed_to(self.tree, start)
+        if root != start_root:
+            return None
+        return invert(start_pose) @ pose
 
     def moving_joint(self, link: str) -> str:
         """Return the name of the nearest moving joint above a link."""
-        above = self.tree.ancestry(link) if self.tree else []
-        return next((joint.name for joint in above[::-1] if joint.kind != "fixed"), "")
-
-    def _links_at_base(self) -> list[str]:
-        assert self.tree is not None
-        root = _fixed_to(self.tree, self.chain.base)[0]
-        return [name for name, _ in self.tree.rigid(root)]
+        if self.tree is None:
+            return ""
+        for joint in reversed(self.tree.ancestry(link)):
+            if joint.kind != "fixed":
+                return joint.name
+        return ""
 
 
 def _fixed_to(tree: UrdfTree, link: str) -> tuple[str, np.ndarray]:
@@ -131,7 +146,7 @@ def stated_frame(statement: str | None, option: str) -> np.ndarray | None:
         raise UsageError(f"{option} {statement}: expected {expected}; found {count} values")
     if np.abs(values[:3]).max() > FARTHEST:
         raise UsageError(f"{option} {statement}: {max(values[:3], key=abs):g} m is too far for a robot; are these mm?")
-    return from_xyz_rpy(values[:3], values[3:] or [0.0, 0.0, 0.0])
+    return from_xyz_rpy(values[:3], values[3:] or NO_TURN)
 
 
 def base_frame(controller: Controller, arm: Description, statement: np.ndarray | None = None) -> ControllerFrame:
@@ -153,7 +168,9 @@ def base_frame(controller: Controller, arm: Description, statement: np.ndarray |
     state = f"state it: --world x,y,z[,roll,pitch,yaw], its pose in '{chain.base}' [m, rad]"
     if not arm.has(link):
         if ruled is None or not footed:
-            reason = rule if ruled is None else f"no link '{foot}' whose axes it would have"
+            reason = rule
+            if ruled is not None:
+                reason = f"no link '{foot}' whose axes it would have"
             return ControllerFrame(name, None, f"not known: no link '{link}', and {reason}; {state}")
         return ControllerFrame(name, ruled, rule)
     pose = arm.pose(link, chain.base)
@@ -163,12 +180,15 @@ def base_frame(controller: Controller, arm: Description, statement: np.ndarray |
     if not footed and ruled is not None and _differs(pose, ruled):
         basis = f"not known: link '{link}' is the description's root, and {name} stands {rule}; {state}"
         return ControllerFrame(name, None, basis)
-    against = arm.pose(link, foot) if footed else None
-    where = _relation(pose, chain.base) if against is None else _relation(against, foot)
+    relation = _relation(pose, chain.base)
+    if footed:
+        pose_on_foot = arm.pose(link, foot)
+        if pose_on_foot is not None:
+            relation = _relation(pose_on_foot, foot)
     warning = ""
     if ruled is not None and _differs(pose, ruled):
         warning = f"link '{link}' does not stand where {name} usually does ({rule}): compare with the pendant"
-    return ControllerFrame(name, pose, f"link {link}, {where}", warning)
+    return ControllerFrame(name, pose, f"link {link}, {relation}", warning)
 
 
 def flange_frame(controller: Controller, arm: Description, statement: np.ndarray | None = None) -> ControllerFrame:
@@ -185,12 +205,14 @@ def flange_frame(controller: Controller, arm: Description, statement: np.ndarray
         pose = arm.pose(link, chain.tip)
         if pose is None:
             return ControllerFrame(name, None, f"not known: link '{link}' is not fixed to '{chain.tip}'; {state}")
-        pose = pose @ from_xyz_rpy([0.0, 0.0, 0.0], np.radians(turn or (0.0, 0.0, 0.0)))
+        pose = pose @ from_xyz_rpy(NO_SHIFT, np.radians(turn or NO_TURN))
         if _off_axis(chain, pose) > STRAIGHT:
             basis = f"not known: z of link '{link}' is not along the last axis, as a flange's is; {state}"
             return ControllerFrame(name, None, basis)
-        by = f"link {link}" + (", turned as this controller's" if turn else "")
-        return ControllerFrame(name, pose, by)
+        basis = f"link {link}"
+        if turn:
+            basis += ", turned as this controller's"
+        return ControllerFrame(name, pose, basis)
     return ControllerFrame(name, None, f"not known: no link 'tool0' or 'flange' in the description; {state}")
 
 
@@ -199,7 +221,9 @@ def _by_rule(controller: Controller, arm: Description) -> tuple[np.ndarray | Non
     foot = arm.prefix + "base_link"
     if not controller.base_at:
         return None, f"nothing is known of {controller.title}"
-    start = foot if arm.has(foot) else arm.chain.base
+    start = arm.chain.base
+    if arm.has(foot):
+        start = foot
     placed = arm.pose(start, arm.chain.base)
     if placed is None:
         return None, f"link '{start}' is not fixed to '{arm.chain.base}'"
@@ -208,11 +232,12 @@ def _by_rule(controller: Controller, arm: Description) -> tuple[np.ndarray | Non
         if height is None:
             return None, f"{controller.base}'s height, that of axis 2, is none in this arm"
         rule = f"by rule at the height of axis 2, {height:.6g} m above {start}"
-        return placed @ from_xyz_rpy([0.0, 0.0, height], [0.0, 0.0, 0.0]), rule
+        return placed @ from_xyz_rpy([0.0, 0.0, height], NO_TURN), rule
     if not arm.has(foot):
         return None, f"there is no link '{foot}' against which {controller.base} stands"
     if controller.base_at == "turned":
-        return placed @ from_xyz_rpy([0.0, 0.0, 0.0], [0.0, 0.0, np.pi]), f"by rule {foot}, turned by 180° about z"
+        turned = placed @ from_xyz_rpy(NO_SHIFT, [0.0, 0.0, np.pi])
+        return turned, f"by rule {foot}, turned by 180° about z"
     return placed, f"by rule at {foot}"
 
 
@@ -220,33 +245,43 @@ def _height_of_axis_2(chain: Chain, foot: np.ndarray) -> float | None:
     """Return the height of axis 2 over a frame [m]; None where axis 1 is not its z, or axis 2 not level."""
     if chain.n < 2:
         return None
-    back = invert(foot)
+    # both axes in the frame
+    T_foot_base = invert(foot)
+    turn, shift = T_foot_base[:3, :3], T_foot_base[:3, 3]
     point_1, axis_1 = _line(chain, 0)
     point_2, axis_2 = _line(chain, 1)
-    axis_1, axis_2 = back[:3, :3] @ axis_1, back[:3, :3] @ axis_2
-    point_1, point_2 = back[:3, :3] @ point_1 + back[:3, 3], back[:3, :3] @ point_2 + back[:3, 3]
-    beside = np.linalg.norm((point_1 - axis_1 * (point_1 @ axis_1))[:2])
-    level = abs(float(axis_2[2])) < STRAIGHT
-    upright = abs(abs(float(axis_1[2])) - 1.0) < STRAIGHT**2
-    return float(point_2[2]) if level and upright and beside < SAME else None
+    axis_1, axis_2 = turn @ axis_1, turn @ axis_2
+    point_1, point_2 = turn @ point_1 + shift, turn @ point_2 + shift
+
+    across = point_1 - axis_1 * (point_1 @ axis_1)
+    is_level = abs(float(axis_2[2])) < STRAIGHT
+    is_upright = abs(abs(float(axis_1[2])) - 1.0) < STRAIGHT**2
+    if is_level and is_upright and np.linalg.norm(across[:2]) < SAME:
+        return float(point_2[2])
+    return None
 
 
 def _line(chain: Chain, joint: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a point of a joint's axis and its direction at q = 0, in the arm's base."""
     frame = joint_frames(chain, np.zeros((1, chain.n)))[joint, 0]
     element = chain.elements[int(chain.moving[joint])]
-    return frame[:3, 3], element.sign * frame[:3, AXES.index(element.axis) % 3]
+    column = AXES.index(element.axis) % 3
+    return frame[:3, 3], element.sign * frame[:3, column]
 
 
 def _off_axis(chain: Chain, pose: np.ndarray) -> float:
     """Return the angle [rad] between z of a frame in the tip and the arm's last axis."""
-    z = (forward(chain, np.zeros((1, chain.n)))[0] @ pose)[:3, 2]
-    return float(np.linalg.norm(np.cross(z, _line(chain, chain.n - 1)[1])))
+    (tip,) = forward(chain, np.zeros((1, chain.n)))
+    z = (tip @ pose)[:3, 2]
+    _, last_axis = _line(chain, chain.n - 1)
+    return float(np.linalg.norm(np.cross(z, last_axis)))
 
 
 def _differs(first: np.ndarray, second: np.ndarray) -> bool:
     between = invert(first) @ second
-    return bool(max(np.linalg.norm(between[:3, 3]), np.linalg.norm(rotation_vector(between[:3, :3]))) > SAME)
+    shift = np.linalg.norm(between[:3, 3])
+    turn = np.linalg.norm(rotation_vector(between[:3, :3]))
+    return bool(max(shift, turn) > SAME)
 
 
 def _relation(pose: np.ndarray, link: str) -> str:
@@ -256,16 +291,22 @@ def _relation(pose: np.ndarray, link: str) -> str:
     if not turned.any() and not shifted.any():
         return f"at {link}"
     if not turned.any() and not shifted[:2].any():
-        return f"{abs(xyz[2]):.6g} m {'above' if xyz[2] > 0 else 'below'} {link}"
-    parts = []
+        side = "above" if xyz[2] > 0 else "below"
+        return f"{abs(xyz[2]):.6g} m {side} {link}"
+    shift, turn = "", ""
     if shifted.any():
-        parts.append(f"at {', '.join(f'{value:.6g}' for value in xyz)} m in {link}")
-    if turned.any() and not turned[:2].any():
-        parts.append(f"{'' if parts else link + ' '}turned by {np.degrees(rpy[2]):.6g}° about z")
-    elif turned.any():
+        position = ", ".join(f"{value:.6g}" for value in xyz)
+        shift = f"at {position} m in {link}"
+    if turned.any():
+        turn = f"turned by {np.degrees(rpy[2]):.6g}° about z"
+    if turned[:2].any():
         angles = ", ".join(f"{value:.6g}" for value in np.degrees(rpy))
-        parts.append(f"{'' if parts else link + ' '}turned by roll, pitch, yaw {angles}°")
-    return ", ".join(parts)
+        turn = f"turned by roll, pitch, yaw {angles}°"
+    if not turn:
+        return shift
+    if not shift:
+        return f"{link} {turn}"
+    return f"{shift}, {turn}"
 
 
 def check_known(frames: list[ControllerFrame], heading: str) -> None:

@@ -23,8 +23,10 @@ from calib.apps.controller_programs.targets import NUMBER, Program, Target, pose
 from calib.controllers.table import Controller
 from calib.errors import UsageError
 
-BLOCK = 400  # letters before a FANUC's pose in which its UF, UT and CONFIG stand
-BEHIND = 120  # letters behind a pose in which its configuration stands
+# letters before a FANUC's pose in which its UF, UT and CONFIG stand
+BLOCK = 400
+# letters behind a pose in which its configuration stands
+BEHIND = 120
 
 
 @dataclass(frozen=True)
@@ -70,12 +72,15 @@ def frames_in(program: Program, further: Mapping[str, str] | None = None) -> Pro
     users: dict[str, np.ndarray] = {}
     texts = {str(program.path): program.text} | dict(further or {})
     for file, text in texts.items():
-        for kind, frames in zip((tools, users), language.numbers(language.without_comments(text), program.controller)):
+        numbers = language.numbers(language.without_comments(text), program.controller)
+        for kind, frames in zip((tools, users), numbers):
             for name, pose in frames.items():
                 if name in kind and np.abs(kind[name] - pose).max() > 1e-9:
                     raise UsageError(f"{file}: {name} is given twice, with other numbers")
                 kind[name] = pose
-    return ProgramFrames(settings, tools | dict.fromkeys(language.flange, np.eye(4)), users | language.base())
+    tools |= dict.fromkeys(language.flange, np.eye(4))
+    users |= language.base()
+    return ProgramFrames(settings, tools, users)
 
 
 Frames = dict[str, np.ndarray]
@@ -118,13 +123,14 @@ def _frame(form: str) -> str:
 
 def _posed(match: re.Match[str], first: int, controller: Controller, count: int = 6) -> np.ndarray:
     """Return the pose (4, 4) of the numbers of a match from a group on."""
-    values = np.array([[float(match[k]) for k in range(first, first + count)]])
-    return pose_of_values(controller, values)[0]
+    values = [float(match[group]) for group in range(first, first + count)]
+    return pose_of_values(controller, np.array([values]))[0]
 
 
 def _either(pairs: set[tuple[str, str]]) -> tuple[str, str]:
     """Return the names of tool and user frame of several moves; where they differ, a name that no frame has."""
-    tools, users = ({names[k] for names in pairs} for k in (0, 1))
+    tools = {tool for tool, _ in pairs}
+    users = {user for _, user in pairs}
     return " or ".join(sorted(tools)), " or ".join(sorted(users))
 
 
@@ -144,9 +150,8 @@ def _tp_setting(text: str, target: Target) -> Setting:
     if not heads:
         return Setting("", "")
     user, tool, configuration = heads[-1].groups(default="")
-    return Setting(
-        _tp_name(text, "UTOOL", tool), _tp_name(text, "UFRAME", user), " ".join(configuration.replace(",", " ").split())
-    )
+    fields = configuration.replace(",", " ").split()
+    return Setting(_tp_name(text, "UTOOL", tool), _tp_name(text, "UFRAME", user), " ".join(fields))
 
 
 def _tp_name(text: str, kind: str, number: str) -> str:
@@ -182,19 +187,26 @@ _KRL_STATUS = re.compile(r"(?i)^\s*,\s*S\s+'?(B?[01]+|\d+)'?\s*,\s*T\s+'?(B?[01]
 
 def _krl_setting(text: str, target: Target) -> Setting:
     begin, end = target.spans[0][0], target.spans[-1][1]
+    configuration = ""
     status = _KRL_STATUS.match(text[end : end + BEHIND])
-    configuration = f"S {_binary(status[1])} T {_binary(status[2])}" if status else ""
+    if status is not None:
+        configuration = f"S {_binary(status[1])} T {_binary(status[2])}"
     point = _KRL_POINT.search(text[max(begin - BLOCK, 0) : begin])
     if point is None:
         return Setting(*_krl_active(text, begin), configuration)
-    if point[1][:1].upper() == "X" and (data := re.search(_KRL_DATA.format("F" + point[1][1:]), text)):
+    data = None
+    if point[1][:1].upper() == "X":
+        data = re.search(_KRL_DATA.format("F" + point[1][1:]), text)
+    if data is not None:
         if re.search(r"(?i)IPO_FRAME\s+#TCP", data[0]):
             raise UsageError(
                 f"line {target.line}: {point[1]} moves about a tool in the cell (IPO_FRAME #TCP): not read"
             )
         return Setting(_krl_name("TOOL", data[1]), _krl_name("BASE", data[2]), configuration)
     moves = re.finditer(rf"(?im)^\s*S?(?:PTP|LIN|CIRC)\b[^\n]*\b{re.escape(point[1])}\b", text)
-    active = {_krl_active(text, move.start()) for move in moves} or {_krl_active(text, len(text))}
+    active = {_krl_active(text, move.start()) for move in moves}
+    if not active:
+        active = {_krl_active(text, len(text))}
     return Setting(*_either(active), configuration)
 
 
@@ -203,7 +215,8 @@ def _krl_active(text: str, position: int) -> tuple[str, str]:
     active = {"TOOL": "", "BASE": ""}
     for match in _KRL_SELECTED.finditer(text, 0, position):
         if match[3]:
-            active[match[3].upper()] = _krl_name(match[3].upper(), match[4])
+            kind = match[3].upper()
+            active[kind] = _krl_name(kind, match[4])
             continue
         expression = re.sub(r"\s+", "", match[2])
         numbered = re.fullmatch(r"(?i)(TOOL|BASE)_DATA\[0*(\d+)\]", expression)
@@ -223,13 +236,16 @@ def _krl_name(kind: str, number: str) -> str:
 
 def _binary(literal: str) -> int:
     """Return the number of ``2`` or of ``B010``."""
-    return int(literal[1:], 2) if literal[:1].upper() == "B" else int(literal)
+    if literal[:1].upper() == "B":
+        return int(literal[1:], 2)
+    return int(literal)
 
 
 def _krl_numbers(text: str, controller: Controller) -> tuple[Frames, Frames]:
     frames: Frames = {}
     for match in _KRL_DECLARED.finditer(text):
-        frames[re.sub(r"\s+", "", match[1]).upper()] = _posed(match, 2, controller)
+        name = re.sub(r"\s+", "", match[1]).upper()
+        frames[name] = _posed(match, 2, controller)
     selected: dict[str, Frames] = {"TOOL": {}, "BASE": {}}
     for match in _KRL_SELECTED.finditer(text):
         literal = re.fullmatch(_KRL_FRAME, (match[2] or "").strip())
@@ -255,8 +271,10 @@ _RAPID_WOBJ = re.compile(r"(?i)\\WObj\s*:=\s*(\w+)")
 
 def _rapid_setting(text: str, target: Target) -> Setting:
     begin, end = target.spans[0][0], target.spans[-1][1]
+    configuration = ""
     configured = _RAPID_CONFIGURATION.match(text, end)
-    configuration = " ".join(configured.groups()) if configured else ""
+    if configured is not None:
+        configuration = " ".join(configured.groups())
     declared = _RAPID_TARGET.search(text[max(begin - BLOCK, 0) : begin])
     if declared is None:
         statement = text[end : text.find(";", end)]
@@ -271,7 +289,9 @@ def _rapid_frames(statement: str) -> tuple[str, str]:
     work = _RAPID_WOBJ.search(statement)
     plain = re.sub(r"\\\w+(?:\s*:=\s*\w+)?", "", statement)
     tool = re.search(r",\s*([A-Za-z_]\w*)\s*$", plain)
-    return tool[1].lower() if tool else "", work[1].lower() if work else "wobj0"
+    tool_name = "" if tool is None else tool[1].lower()
+    work_name = "wobj0" if work is None else work[1].lower()
+    return tool_name, work_name
 
 
 def _rapid_numbers(text: str, controller: Controller) -> tuple[Frames, Frames]:
@@ -286,7 +306,9 @@ def _rapid_numbers(text: str, controller: Controller) -> tuple[Frames, Frames]:
             raise UsageError(f"wobjdata {match[1]}: a work object that the robot holds (robhold TRUE) is not read")
         if match[3].upper() == "FALSE" or match[4]:
             raise UsageError(f"wobjdata {match[1]}: a work object on a moving mechanical unit is not read")
-        users[match[1].lower()] = _posed(match, 5, controller, 7) @ _posed(match, 12, controller, 7)
+        user_frame = _posed(match, 5, controller, 7)
+        object_frame = _posed(match, 12, controller, 7)
+        users[match[1].lower()] = user_frame @ object_frame
     return tools, users
 
 
@@ -298,10 +320,11 @@ _UR_POSE = re.compile(_frame(r"p \[ NUM , NUM , NUM , NUM , NUM , NUM \]"))
 
 def _ur_setting(text: str, target: Target) -> Setting:
     begin = target.spans[0][0]
-    calls = [match for match in _UR_TCP.finditer(text) if match.start() < begin]
-    if not calls:
-        return Setting("", "Base")
-    return Setting(_ur_name(text, calls[-1]), "Base")
+    tool = ""
+    for call in _UR_TCP.finditer(text):
+        if call.start() < begin:
+            tool = _ur_name(text, call)
+    return Setting(tool, "Base")
 
 
 def _ur_name(text: str, call: re.Match[str]) -> str:
@@ -317,25 +340,29 @@ def _ur_numbers(text: str, controller: Controller) -> tuple[Frames, Frames]:
     return tools, {}
 
 
-LANGUAGES = {
-    "tp": Language(
-        "!",
-        _tp_setting,
-        _tp_numbers,
-        ("UTOOL[0]",),
-        ("UFRAME[0]",),
-        "SYSFRAME.VA of a backup, or lines as 'UTOOL[1]: X 0.0, Y 0.0, Z 0.0 mm, W 0.0, P 0.0, R 0.0 deg'",
-    ),
-    "krl": Language(
-        ";",
-        _krl_setting,
-        _krl_numbers,
-        ("TOOL_DATA[0]", "$NULLFRAME"),
-        ("BASE_DATA[0]", "$NULLFRAME", "$WORLD"),
-        "$config.dat, or lines as 'TOOL_DATA[1]={X 0.0,Y 0.0,Z 0.0,A 0.0,B 0.0,C 0.0}'",
-    ),
-    "rapid": Language(
-        "!", _rapid_setting, _rapid_numbers, ("tool0",), ("wobj0",), "the module that declares tooldata and wobjdata"
-    ),
-    "urscript": Language("#", _ur_setting, _ur_numbers, (), ("Base",), ""),
-}
+TP = Language(
+    comment="!",
+    setting=_tp_setting,
+    numbers=_tp_numbers,
+    flange=("UTOOL[0]",),
+    world=("UFRAME[0]",),
+    files="SYSFRAME.VA of a backup, or lines as 'UTOOL[1]: X 0.0, Y 0.0, Z 0.0 mm, W 0.0, P 0.0, R 0.0 deg'",
+)
+KRL = Language(
+    comment=";",
+    setting=_krl_setting,
+    numbers=_krl_numbers,
+    flange=("TOOL_DATA[0]", "$NULLFRAME"),
+    world=("BASE_DATA[0]", "$NULLFRAME", "$WORLD"),
+    files="$config.dat, or lines as 'TOOL_DATA[1]={X 0.0,Y 0.0,Z 0.0,A 0.0,B 0.0,C 0.0}'",
+)
+RAPID = Language(
+    comment="!",
+    setting=_rapid_setting,
+    numbers=_rapid_numbers,
+    flange=("tool0",),
+    world=("wobj0",),
+    files="the module that declares tooldata and wobjdata",
+)
+URSCRIPT = Language(comment="#", setting=_ur_setting, numbers=_ur_numbers, flange=(), world=("Base",), files="")
+LANGUAGES = {"tp": TP, "krl": KRL, "rapid": RAPID, "urscript": URSCRIPT}

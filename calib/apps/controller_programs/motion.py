@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.apps.controller_programs.targets import number
+from calib.apps.controller_programs.targets import formatted
 from calib.controllers.table import Controller
 from calib.data.csv_table import read_header, read_table
-from calib.errors import UsageError, require
-from calib.toolkit.opened_results import open_result
+from calib.errors import UsageError
+from calib.toolkit.result_folders import open_result
 
 PREFIX = "q_"
 
@@ -45,24 +45,24 @@ def setpoints(path: Path, controller: Controller) -> tuple[np.ndarray, list[str]
     if not controller.stream:
         raise UsageError(f"{path} is a motion, and {controller.title} takes no stream; give a list of poses")
     table = read_table(path)
-    names = [name for name in table.header if name.startswith(PREFIX)]
-    require(names, f"{path}: no positions ({PREFIX}joint1 [rad]); found {', '.join(table.header)}", UsageError)
-    t, q = table.numbers("t", None), np.column_stack([table.numbers(name, "angle") for name in names])
-    rising = len(t) > 3 and bool(np.all(np.diff(t) > 0.0))
-    require(rising, f"{path}: expected at least four rows of rising t", UsageError)
+    columns = [name for name in table.header if name.startswith(PREFIX)]
+    if not columns:
+        raise UsageError(f"{path}: no positions ({PREFIX}joint1 [rad]); found {', '.join(table.header)}")
+    t = table.numbers("t", None)
+    q = np.column_stack([table.numbers(name, "angle") for name in columns])
+    rising = np.all(np.diff(t) > 0.0)
+    if len(t) <= 3 or not rising:
+        raise UsageError(f"{path}: expected at least four rows of rising t")
     count = round(float(t[-1] - t[0]) / controller.cycle)
-    when = np.minimum(t[0] + controller.cycle * np.arange(count + 1), t[-1])
-    return CubicSpline(t, q)(when), [name.removeprefix(PREFIX) for name in names]
+    times = t[0] + controller.cycle * np.arange(count + 1)
+    # a rounded number of cycles may end behind the motion
+    times = np.minimum(times, t[-1])
+    return CubicSpline(t, q)(times), [name.removeprefix(PREFIX) for name in columns]
 
 
 def stream_values(controller: Controller, q: np.ndarray) -> dict[str, object]:
     """Return what the templates of streams print of setpoints (k, n) [rad]."""
     controller_values = controller.shown(q)
-    rows = _formatted(controller_values, controller)
-    relative = _formatted(controller_values - controller_values[0], controller)
+    rows = formatted(controller_values, controller.decimals)
+    relative = formatted(controller_values - controller_values[0], controller.decimals)
     return {"rows": rows, "relative": relative, "cycle": controller.cycle, "unit": controller.unit}
-
-
-def _formatted(values: np.ndarray, controller: Controller) -> list[list[str]]:
-    """Return values (k, n) as text with the controller's decimals."""
-    return [[number(value, controller.decimals) for value in row] for row in values]

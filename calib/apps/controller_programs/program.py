@@ -21,12 +21,12 @@ import numpy as np
 from calib import files
 from calib.apps.controller_programs.motion import is_motion, setpoints, stream_values
 from calib.apps.controller_programs.program_settings import CSV, ProgramSettings
-from calib.apps.controller_programs.targets import is_program, number, read_program
+from calib.apps.controller_programs.targets import formatted, is_program, read_program
 from calib.controllers.table import Controller, check_controller, controller_named
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.columns import OURS
 from calib.data.poses.pose_lists import read_poses
-from calib.errors import UsageError, require
+from calib.errors import UsageError
 from calib.procedure.report.templates import read
 from calib.units import ANGLES, LENGTHS
 
@@ -44,16 +44,25 @@ def joints_in(path: Path, source: str = "") -> tuple[np.ndarray, list[str]]:
     """
     if source or is_program(path):
         program = read_program(path, source)
-        require(program.of("joints"), f"{path}: its targets are poses of the tool, not joints", UsageError)
+        if not program.of("joints"):
+            raise UsageError(f"{path}: its targets are poses of the tool, not joints")
         q = program.joints()
-        return q, [f"q{k + 1}" for k in range(q.shape[1])]
+        return q, [f"q{number}" for number in range(1, q.shape[1] + 1)]
+
     table = read_table(path)
-    column_units = [(name, unit.lower()) for name, unit in zip(table.header, table.units) if name not in OURS]
-    sliding = [name for name, unit in column_units if unit in LENGTHS]
-    require(not sliding, f"{path}: programs have turning joints only; {', '.join(sliding)} slides", UsageError)
-    names = [name for name, unit in column_units if unit in ANGLES]
-    message = f"{path}: no column of joint angles, as 'joint1 [deg]'; found {', '.join(table.header)}"
-    require(names, message, UsageError)
+    names, sliding = [], []
+    for name, unit in zip(table.header, table.units):
+        if name in OURS:
+            continue
+        if unit.lower() in LENGTHS:
+            sliding.append(name)
+        elif unit.lower() in ANGLES:
+            names.append(name)
+    if sliding:
+        raise UsageError(f"{path}: programs have turning joints only; {', '.join(sliding)} slides")
+    if not names:
+        columns = ", ".join(table.header)
+        raise UsageError(f"{path}: no column of joint angles, as 'joint1 [deg]'; found {columns}")
     return read_poses(path, names), names
 
 
@@ -63,12 +72,18 @@ def joints_table(path: Path, source: str = "") -> Table:
     So do the joints that a controller kept: a UR's log, a KUKA's ``.dat``, a FANUC's ``POSREG.VA``.
     """
     q, names = joints_in(path, source)
-    program = read_program(path, source) if source or is_program(path) else None
-    numbers = np.array([program.targets[k].number for k in program.of("joints")] if program else [0])
-    numbered = {"pose": numbers} if numbers.all() else {}
+    header = list(names)
+    units = ["deg"] * len(names)
+    columns = list((q / ANGLES["deg"]).T)
+    if source or is_program(path):
+        program = read_program(path, source)
+        numbers = np.array([program.targets[k].number for k in program.of("joints")])
+        if numbers.all():
+            header.insert(0, "pose")
+            units.insert(0, "")
+            columns.insert(0, numbers)
     rows = np.arange(1, len(q) + 1)
-    cells = (*numbered.values(), *(q / ANGLES["deg"]).T)
-    return Table(str(path), (*numbered, *names), (*("" for _ in numbered), *("deg" for _ in names)), cells, rows)
+    return Table(str(path), tuple(header), tuple(units), tuple(columns), rows)
 
 
 def program_files(
@@ -88,25 +103,52 @@ def program_files(
         UsageError: for an unknown controller, a name that it does not take, another number of axes, and an output where
             it has none.
     """
-    settings, moving = settings or ProgramSettings(), not (source or is_program(path)) and is_motion(path)
+    settings = settings or ProgramSettings()
     if name == CSV:
-        table = joints_table(path, source)
-        header = [f"{name} [{unit}]" if unit else name for name, unit in zip(table.header, table.units)]
-        rows = [",".join(f"{value:.12g}" for value in row) for row in zip(*table.cells)]
-        return {out: "\n".join([",".join(header), *rows, ""])}
-    controller, stem = controller_named(name), out.stem
+        return {out: _csv_text(joints_table(path, source))}
+    controller = controller_named(name)
+    stem = out.stem
     if not re.fullmatch(controller.names, stem):
         rule = _name_rule(controller.names)
         raise UsageError(f"{out}: '{stem}' is no name for a program of {controller.title}: {rule}")
-    q, names = setpoints(path, controller) if moving else joints_in(path, source)
+
+    moving = not (source or is_program(path)) and is_motion(path)
+    if moving:
+        q, names = setpoints(path, controller)
+    else:
+        q, names = joints_in(path, source)
     check_controller(name, q.shape[1], settings.pulses)
     if settings.output is not None and not controller.outputs:
         raise UsageError(f"--output: {controller.title} raises no output; the operator presses a key")
-    values = stream_values(controller, q) if moving else {"poses": _poses(controller, q, settings)}
-    values |= {"name": stem, "joints": names, "head": _head(controller, names, moving), **vars(settings)}
-    templates = controller.stream if moving else controller.files
-    paths = _targets(out, [pattern.format(name=stem) for pattern in templates.values()], controller)
-    return {path: _template(file).render(values) for path, file in zip(paths, templates)}
+    values: dict[str, object]
+    if moving:
+        templates = controller.stream
+        values = {**stream_values(controller, q)}
+    else:
+        templates = controller.files
+        values = {"poses": _poses(controller, q, settings)}
+    values["name"] = stem
+    values["joints"] = names
+    values["head"] = _head(controller, names, moving)
+    values["settle"] = settings.settle
+    values["speed"] = settings.speed
+    values["output"] = settings.output
+    values["pulses"] = settings.pulses
+    file_names = [pattern.format(name=stem) for pattern in templates.values()]
+    texts = {}
+    for target, template in zip(_targets(out, file_names, controller), templates):
+        texts[target] = _template(template).render(values)
+    return texts
+
+
+def _csv_text(table: Table) -> str:
+    """Return the text of a table: units in the header, numbers with twelve digits."""
+    header = [f"{name} [{unit}]" if unit else name for name, unit in zip(table.header, table.units)]
+    lines = [",".join(header)]
+    for row in zip(*table.cells):
+        numbers = [f"{value:.12g}" for value in row]
+        lines.append(",".join(numbers))
+    return "\n".join([*lines, ""])
 
 
 def _targets(out: Path, names: list[str], controller: Controller) -> list[Path]:
@@ -117,20 +159,24 @@ def _targets(out: Path, names: list[str], controller: Controller) -> list[Path]:
     if len(names) == 1:
         return [out]
     suffixes = [path.suffix for path in usual]
-    message = f"{out}: {controller.title} takes {', '.join(suffixes)}, written together; end the name in {suffixes[0]}"
-    require(out.suffix.lower() in suffixes, message, UsageError)
+    if out.suffix.lower() not in suffixes:
+        together = f"{', '.join(suffixes)}, written together"
+        raise UsageError(f"{out}: {controller.title} takes {together}; end the name in {suffixes[0]}")
     return usual
 
 
 def write_program(path: Path, out: Path, name: str) -> list[Path]:
     """Write the program of a session's planned poses; return its files."""
-    return [files.write(target, content) for target, content in program_files(path, out, name).items()]
+    texts = program_files(path, out, name)
+    return [files.write(target, text) for target, text in texts.items()]
 
 
 def _poses(controller: Controller, q: np.ndarray, settings: ProgramSettings) -> list[list[str]]:
     """Return poses (m, n) [rad] as a controller's programs have them."""
-    values = controller.shown(q) * (np.array(settings.pulses) if controller.pulses else 1.0)
-    return [[number(value, controller.decimals) for value in row] for row in values]
+    values = controller.shown(q)
+    if controller.pulses:
+        values = values * np.array(settings.pulses)
+    return formatted(values, controller.decimals)
 
 
 def _head(controller: Controller, names: list[str], moving: bool) -> list[str]:

@@ -6,7 +6,8 @@ from typing import Annotated
 from calib.config import strict
 from calib.config_types import Real, Whole
 
-CSV = "csv"  # in place of a controller: the poses of a program as a table
+# in place of a controller: the poses of a program as a table
+CSV = "csv"
 
 
 @strict

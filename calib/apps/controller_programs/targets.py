@@ -18,10 +18,10 @@ from calib.transforms import pose as pose_of
 from calib.units import ANGLES
 
 NUMBER = r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)"
-ENCODING = "latin-1"  # one letter for each byte, whatever the program is in
-
-
-NEAR = 200  # letters before a target in which its number stands (our choice)
+# one letter for each byte, whatever the program is in
+ENCODING = "latin-1"
+# letters before a target in which its number stands (our choice)
+NEAR = 200
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,8 @@ class Program:
     def unread(self) -> str:
         """Warning where motion statements have no target here, with the first of their lines; else empty."""
         target_lines = {target.line for target in self.targets}
-        lines = [line for line in _lines_of_moves(self.text, self.controller) if line not in target_lines]
+        move_lines = _lines_of_moves(self.text, self.controller)
+        lines = [line for line in move_lines if line not in target_lines]
         if self.moves <= len(self.targets) or not lines:
             return ""
         location = f"line {listing(lines, 3)}"
@@ -78,46 +79,69 @@ class Program:
 
     def joints(self) -> np.ndarray:
         """Return the joint targets (m, n) as joints of a description [rad]."""
-        values = [self.targets[k].values for k in self.of("joints")]
-        return self.controller.described(np.array(values) * ANGLES[self.controller.unit])
+        values = self._values("joints")
+        return self.controller.described(values * ANGLES[self.controller.unit])
 
     def poses(self) -> np.ndarray:
         """Return the pose targets (m, 4, 4) [m]."""
-        return pose_of_values(self.controller, np.array([self.targets[k].values for k in self.of("pose")]))
+        return pose_of_values(self.controller, self._values("pose"))
+
+    def _values(self, kind: str) -> np.ndarray:
+        """Return the numbers of the targets of a kind, one row per target."""
+        return np.array([target.values for target in self.targets if target.kind == kind])
 
     def rewritten(self, values: Sequence[np.ndarray | None]) -> bytes:
         """Return the program with other numbers in its targets, in the controller's units; None leaves a target."""
-        text, parts, position = self.text, [], 0
-        for target, new in zip(self.targets, values, strict=True):
-            for (begin, end), was, value in zip(target.spans, target.values, [] if new is None else new):
-                decimals = max(self.controller.decimals, len(text[begin:end].partition(".")[2]))
-                parts += [text[position:begin], text[begin:end] if value == was else number(value, decimals)]
+        text = self.text
+        parts = []
+        position = 0
+        for target, new_values in zip(self.targets, values, strict=True):
+            if new_values is None:
+                continue
+            for (begin, end), old_value, value in zip(target.spans, target.values, new_values):
+                written = text[begin:end]
+                # a number that stays the same stays as it is written
+                if value != old_value:
+                    fraction = text[begin:end].partition(".")[2]
+                    written = number(value, max(self.controller.decimals, len(fraction)))
+                parts += [text[position:begin], written]
                 position = end
-        return "".join([*parts, text[position:]]).encode(ENCODING)
+        parts.append(text[position:])
+        return "".join(parts).encode(ENCODING)
 
 
 def number(value: float, decimals: int) -> str:
     """Return a number with fixed decimals; no negative zero."""
     written = f"{value:.{decimals}f}"
-    return written.removeprefix("-") if float(written) == 0.0 else written
+    if float(written) == 0.0:
+        return written.removeprefix("-")
+    return written
+
+
+def formatted(values: np.ndarray, decimals: int) -> list[list[str]]:
+    """Return values (m, n) as texts with fixed decimals."""
+    return [[number(value, decimals) for value in row] for row in values]
 
 
 def pose_values(controller: Controller, poses: np.ndarray) -> np.ndarray:
     """Return the numbers (m, 6 or 7) of poses (m, 4, 4) [m] as they stand in a controller's programs."""
-    turn, rotation = controller.turn, Rotation.from_matrix(poses[:, :3, :3])
-    if turn == "wxyz":
+    rotation = Rotation.from_matrix(poses[:, :3, :3])
+    if controller.turn == "wxyz":
         angles = rotation.as_quat(canonical=True)[:, [3, 0, 1, 2]]
-    elif turn == "vector":
+    elif controller.turn == "vector":
         angles = rotation.as_rotvec()
     else:
-        order, degrees = _order(turn)
+        order, degrees = _order(controller.turn)
         angles = rotation.as_euler(order, degrees)
-    return np.concatenate([poses[:, :3, 3] / controller.metres, angles], axis=1)
+    position = poses[:, :3, 3] / controller.metres
+    return np.concatenate([position, angles], axis=1)
 
 
 def pose_of_values(controller: Controller, values: np.ndarray) -> np.ndarray:
     """Return the poses (m, 4, 4) [m] of their numbers (m, 6 or 7) in a controller's programs."""
-    return pose_of(_rotation(controller.turn, values[:, 3:]), values[:, :3] * controller.metres)
+    rotation = _rotation(controller.turn, values[:, 3:])
+    position = values[:, :3] * controller.metres
+    return pose_of(rotation, position)
 
 
 def _rotation(turn: str, values: np.ndarray) -> Rotation:
@@ -132,7 +156,9 @@ def _rotation(turn: str, values: np.ndarray) -> Rotation:
 def _order(turn: str) -> tuple[str, bool]:
     """Return the axes of a pose's angles as SciPy names them, and whether the angles are in degrees."""
     axes, axes_kind, *unit = turn.split()
-    return axes.upper() if axes_kind == "moving" else axes, unit != ["rad"]
+    # SciPy's capitals are axes that turn with the body
+    order = axes.upper() if axes_kind == "moving" else axes
+    return order, unit != ["rad"]
 
 
 def is_program(path: Path) -> bool:
@@ -167,18 +193,21 @@ def read_program(path: Path, controller: str = "") -> Program:
     """
     kind = controller_of(path, controller)
     text = text_of(path)
-    targets = [target for name in ("joints", "pose") for target in _targets_of_kind(text, name, kind)]
+    targets = _targets_of_kind(text, "joints", kind) + _targets_of_kind(text, "pose", kind)
     if not targets:
         moves = listing(_lines_of_moves(text, kind), 3)
-        message = f"has no targets with all their numbers, as {kind.title} writes them"
-        moves_message = f"; its moves are in line {moves}" if moves else "; nor any moves"
-        raise MeasurementError(message + moves_message, path)
-    return Program(path, kind, text, tuple(sorted(targets, key=lambda target: target.spans[0])))
+        moves_message = f"its moves are in line {moves}" if moves else "nor any moves"
+        message = f"has no targets with all their numbers, as {kind.title} writes them; {moves_message}"
+        raise MeasurementError(message, path)
+    targets.sort(key=lambda target: target.spans[0])
+    return Program(path, kind, text, tuple(targets))
 
 
 def _matches(text: str, pattern: str, comment: str) -> list[re.Match[str]]:
     """Return what matches a pattern outside comments."""
-    matches = re.finditer(pattern.replace("NUM", NUMBER), text) if pattern else ()
+    if not pattern:
+        return []
+    matches = re.finditer(pattern.replace("NUM", NUMBER), text)
     if not comment:
         return list(matches)
     outside_comments = []
@@ -192,15 +221,33 @@ def _matches(text: str, pattern: str, comment: str) -> list[re.Match[str]]:
 def _lines_of_moves(text: str, controller: Controller) -> list[int]:
     """Return the lines of the motion statements, from 1."""
     matches = _matches(text, controller.moves, controller.comment)
-    return [text.count("\n", 0, match.end()) + 1 for match in matches]
+    return [_line_at(text, match.end()) for match in matches]
+
+
+def _line_at(text: str, position: int) -> int:
+    """Return the line of a position in a text, from 1."""
+    return text.count("\n", 0, position) + 1
 
 
 def _targets_of_kind(text: str, kind: str, controller: Controller) -> list[Target]:
+    pattern = controller.joints if kind == "joints" else controller.pose
     targets = []
-    for match in _matches(text, getattr(controller, kind), controller.comment):
-        places = range(1, len(match.groups()) + 1)
-        spans, values = tuple(map(match.span, places)), tuple(float(match[k]) for k in places)
-        numbered = re.search(rf"(?:{controller.numbered})$", text[max(match.start() - NEAR, 0) : match.start(1)])
-        number = int(next(filter(None, numbered.groups()))) if controller.numbered and numbered else 0
-        targets.append(Target(text.count("\n", 0, match.start()) + 1, spans, values, kind, number))
+    for match in _matches(text, pattern, controller.comment):
+        groups = range(1, len(match.groups()) + 1)
+        spans = tuple(match.span(group) for group in groups)
+        values = tuple(float(group) for group in match.groups())
+        pose_number = _pose_number(text, match, controller)
+        targets.append(Target(_line_at(text, match.start()), spans, values, kind, pose_number))
     return targets
+
+
+def _pose_number(text: str, match: re.Match[str], controller: Controller) -> int:
+    """Return the number of a pose that the text before its target says; 0 where it says none."""
+    if not controller.numbered:
+        return 0
+    before = text[max(match.start() - NEAR, 0) : match.start(1)]
+    numbered = re.search(rf"(?:{controller.numbered})$", before)
+    if numbered is None:
+        return 0
+    digits = [group for group in numbered.groups() if group]
+    return int(digits[0])

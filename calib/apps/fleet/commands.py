@@ -29,19 +29,23 @@ def run(sessions: list[str], workers: str = "1", plots: bool = True) -> None:
     from calib.toolkit.sessions import folders_of
     from calib.workers import workers as opened
 
-    folders, started, outcomes, pace = folders_of(sessions, stores.sessions), time.perf_counter(), [], Throughput()
+    started = time.perf_counter()
+    folders = folders_of(sessions, stores.sessions)
+    pace = Throughput()
+    outcomes = []
     with reporting() as (say, progress):
         progress(f"running {len(folders)} sessions")
         for outcome in runs.run(folders, opened(workers), f"calib run --workers {workers}", plots, pace):
             outcomes.append(outcome)
             say(outcome.line())
             progress(f"{len(outcomes)} of {len(folders)} sessions")
-    places = [str(folder) for folder in folders]
-    outcomes.sort(key=lambda outcome_: places.index(outcome_.folder))
+    order = {str(folder): number for number, folder in enumerate(folders)}
+    outcomes.sort(key=lambda outcome: order[outcome.folder])
     say(runs.table(outcomes), result=True)
     say(*runs.remarks(outcomes), *pace.lines())
     say(runs.summary(outcomes, time.perf_counter() - started))
-    if code := max(outcome_.code for outcome_ in outcomes):
+    code = max(outcome.code for outcome in outcomes)
+    if code:
         raise typer.Exit(code)
 
 
@@ -70,5 +74,6 @@ def fleet(calibrations: list[Path], out: Path | None = None) -> None:
     if out is not None:
         report.save(out)
     say(*report.renderables(), result=True)
-    say(*([f"written to {out}"] if out else []))
+    if out is not None:
+        say(f"written to {out}")
     exit_failed(report.verdict.level)

@@ -24,7 +24,10 @@ from calib.workers import Workers
 from calib.workers import workers as opened
 
 LOG = "run.log"
-WAITS, BUSY, FAILED = "waits", "busy", "failed"  # what a session comes to, or `DONE`
+# what a session comes to, or `DONE`
+WAITS = "waits"
+BUSY = "busy"
+FAILED = "failed"
 
 
 @dataclass(frozen=True)
@@ -106,15 +109,21 @@ def run(
 ) -> Iterator[FleetRow]:
     """Run every session and yield each outcome; workers on other machines need the same folder paths, or addresses."""
     pace = pace or Throughput()
+    run_folder = partial(run_session, command=command, plots=plots)
     with workers as crew:
-        sent = [folder if crew.here or isinstance(folder, str) else folder.absolute() for folder in folders]
-        for number, outcome in pace.completed(crew, partial(run_one, command=command, plots=plots), sent):
+        tasks = list(folders)
+        if not crew.here:
+            # another process may stand in another folder
+            tasks = [folder.absolute() if isinstance(folder, Path) else folder for folder in folders]
+        for number, outcome in pace.completed(crew, run_folder, tasks):
             name = str(folders[number])
-            lost = isinstance(outcome, TaskLost)
-            yield FleetRow(name, FAILED, words=str(outcome), code=2) if lost else replace(outcome, folder=name)
+            if isinstance(outcome, TaskLost):
+                yield FleetRow(name, FAILED, words=str(outcome), code=2)
+            else:
+                yield replace(outcome, folder=name)
 
 
-def run_one(folder: Path | str, command: str = "calib run", plots: bool = True, lease: float = LEASE) -> FleetRow:
+def run_session(folder: Path | str, command: str = "calib run", plots: bool = True, lease: float = LEASE) -> FleetRow:
     """Run one session as far as possible, and write its output to ``run.log``. It raises nothing but Ctrl-C.
 
     Args:
@@ -130,36 +139,66 @@ def run_one(folder: Path | str, command: str = "calib run", plots: bool = True, 
         with stores.held(folder, lease) as copy:
             outcome = _run_here(copy, command, plots)
     except CalibError as error:
-        state = BUSY if isinstance(error, Busy) else FAILED
-        outcome = FleetRow(folder, state, words=str(error), code=2)
+        outcome = FleetRow(folder, _state_of(error), words=str(error), code=2)
     return replace(outcome, folder=folder, seconds=time.perf_counter() - started)
 
 
 def _run_here(folder: Path, command: str, plots: bool) -> FleetRow:
-    started, messages = time.perf_counter(), []
+    started = time.perf_counter()
+    messages: list[str] = []
     try:
         outcome = _go_on(folder, messages.append, command, plots)
     except Exception as error:  # a robot that fails must not stop the others
         foreseen = complaint(error)
-        message, code = foreseen or (bug_reports.report(error, command.split()[1:], folder), bug_reports.CODE)
+        if foreseen:
+            message, code = foreseen
+        else:
+            message = bug_reports.report(error, command.split()[1:], folder)
+            code = bug_reports.CODE
         messages.append(f"failed: {message}")
-        outcome = FleetRow(str(folder), BUSY if isinstance(error, Busy) else FAILED, words=message, code=code)
-    if (folder / SETTINGS).exists() and outcome.state != BUSY:  # the log is of the command that works on it
-        with suppress(CalibError):  # a full disk, a folder that cannot be written: said already
+        outcome = FleetRow(str(folder), _state_of(error), words=message, code=code)
+    # The log of a busy session is of the command that works on it.
+    if (folder / SETTINGS).exists() and outcome.state != BUSY:
+        # A full disk, or a folder that cannot be written, is said already.
+        with suppress(CalibError):
             files.write(folder / LOG, "\n".join(messages) + "\n")
     return replace(outcome, seconds=time.perf_counter() - started)
 
 
+def _state_of(error: Exception) -> str:
+    if isinstance(error, Busy):
+        return BUSY
+    return FAILED
+
+
 def _go_on(folder: Path, say: Say, command: str, plots: bool) -> FleetRow:
-    stop = go_on(folder, say, lambda text: None, command, plots=plots)
-    session = stop.session
+    stop = go_on(folder, say, _no_progress, command, plots=plots)
     if stop.waiting is not None:
-        for text in stop.lines[1:]:
-            say(text)
+        instructions = stop.lines[1:]
+        for line in instructions:
+            say(line)
         text = f"{stop.waiting.words} (step {stop.waiting.step.name}); instructions are in {LOG}"
-        return FleetRow(str(folder), WAITS, words=text, asks=stop.lines[1:])
-    errors, torque = position_errors(session) or (None, None), torque_error(session)
-    return FleetRow(str(folder), DONE, stop.verdict, "", *errors, torque, code=1 if stop.verdict == "fail" else 0)
+        return FleetRow(str(folder), WAITS, words=text, asks=instructions)
+    nominal = calibrated = None
+    errors = position_errors(stop.session)
+    if errors:
+        nominal, calibrated = errors
+    code = 0
+    if stop.verdict == "fail":
+        code = 1
+    return FleetRow(
+        folder=str(folder),
+        state=DONE,
+        verdict=stop.verdict,
+        nominal=nominal,
+        calibrated=calibrated,
+        torque=torque_error(stop.session),
+        code=code,
+    )
+
+
+def _no_progress(message: str) -> None:
+    pass
 
 
 def table(outcomes: Sequence[FleetRow]) -> RenderableType:
@@ -173,10 +212,10 @@ def table(outcomes: Sequence[FleetRow]) -> RenderableType:
         if names.count(name) > 1:
             label = row.folder
         cells: list[Text | str] = [Text(label)]
-        for word in (row.state, row.verdict):
+        for state in (row.state, row.verdict):
             cell: Text | str = ""
-            if word:
-                cell = Text(word, COLOURS.get(word, "yellow"))
+            if state:
+                cell = Text(state, COLOURS.get(state, "yellow"))
             cells.append(cell)
         for number in (row.nominal, row.calibrated, row.torque):
             printed = ""
@@ -202,11 +241,11 @@ def summary(outcomes: Sequence[FleetRow], seconds: float) -> str:
     """Return one line with the number of sessions for each state and verdict."""
     states = Counter(row.state for row in outcomes)
     verdicts = Counter(row.verdict for row in outcomes)
-    done = f"{states[DONE]} of {len(outcomes)} done"
+    finished = f"{states[DONE]} of {len(outcomes)} done"
     levels = [f"{verdicts[level]} {level}" for level in LEVELS if verdicts[level]]
     if levels:
-        done += f" ({', '.join(levels)})"
-    parts = [done]
+        finished += f" ({', '.join(levels)})"
+    parts = [finished]
     for state, label in ((WAITS, "waiting"), (BUSY, BUSY), (FAILED, FAILED)):
         if states[state]:
             parts.append(f"{states[state]} {label}")

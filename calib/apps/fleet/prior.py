@@ -23,9 +23,17 @@ from calib.errors import UsageError, require
 from calib.toolkit.chains import CalibratedChain, nominal_of, write_calibrated
 from calib.toolkit.installations import Installation, families
 
-FAMILY = 4.0  # arms that the variance of a family of parameters counts as (our choice)
-MIN_WIDTH = 1e-6  # [m, rad] of the prior (our choice)
-OPTIONS = "options.toml"  # in the prior's folder
+# arms that the variance of a family of parameters counts as (our choice)
+FAMILY = 4.0
+# [m, rad] of the prior (our choice)
+MIN_WIDTH = 1e-6
+# of τ², [m², rad²], from which expectation maximisation starts
+FIRST_VARIANCE = 1e-4
+# it ends at this relative change of τ², or after so many updates (our choice)
+SETTLED = 1e-4
+MAX_UPDATES = 500
+# in the prior's folder
+OPTIONS = "options.toml"
 
 
 @dataclass(frozen=True)
@@ -94,24 +102,28 @@ def _most_probable(
     data: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], family: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return μ (k,) and τ (k,) of each arm's (fitted parameters, C⁻¹, C⁻¹ x̂) by expectation maximisation."""
-    mean, variance = np.zeros(len(family)), np.full(len(family), 1e-4)
+    mean = np.zeros(len(family))
+    variance = np.full(len(family), FIRST_VARIANCE)
     count = np.sum([fitted for fitted, _, _ in data], axis=0)
-    max_updates, settled = 500, 1e-4  # of τ² (our choice)
-    for _ in range(max_updates):
-        total, square, estimates = np.zeros_like(mean), np.zeros_like(mean), list[tuple[np.ndarray, np.ndarray]]()
+    for _ in range(MAX_UPDATES):
+        total = np.zeros_like(mean)
+        square = np.zeros_like(mean)
+        estimates = []
         for fitted, information, pull in data:
-            spread = np.linalg.inv(information + np.diag(1.0 / variance[fitted]))
-            estimate = spread @ (pull + mean[fitted] / variance[fitted])
+            covariance = np.linalg.inv(information + np.diag(1.0 / variance[fitted]))
+            estimate = covariance @ (pull + mean[fitted] / variance[fitted])
             total[fitted] += estimate
-            square[fitted] += np.diag(spread)
+            square[fitted] += np.diag(covariance)
             estimates.append((fitted, estimate))
-        mean, before = total / (count + 1), variance
+        mean = total / (count + 1)
         for fitted, estimate in estimates:
             square[fitted] += (estimate - mean[fitted]) ** 2
-        square += mean**2  # of the nominal
+        # the nominal counts as an arm
+        square += mean**2
         pooled = np.bincount(family, square) / np.bincount(family, count)
+        earlier_variance = variance
         variance = np.maximum((FAMILY * pooled[family] + square) / (FAMILY + count), MIN_WIDTH**2)
-        if np.abs(np.log(variance / before)).max() < settled:
+        if np.abs(np.log(variance / earlier_variance)).max() < SETTLED:
             break
     return mean, np.sqrt(variance)
 

@@ -25,7 +25,7 @@ from calib.records import plain
 from calib.result_kinds import BY_NAME
 from calib.toolkit.installations import PLAUSIBLE
 from calib.toolkit.report_pages import Block, RecordColumn, Section, Text, table
-from calib.toolkit.result_folders import Judged, Verdict, lines_of, settle
+from calib.toolkit.result_folders import Judged, Verdict, notes_of, settle
 from calib.units import small
 
 PAGE, PRIOR = "report.html", "prior"
@@ -84,15 +84,15 @@ class FleetReport(Judged):
         """Return the report's section."""
         drift = [
             RecordColumn("arm", "{0[0]}", number=False),
-            RecordColumn("from", lambda arm_type: Path(arm_type[1].parts[0].before.name).name, False),
-            RecordColumn("to", lambda arm_type: Path(arm_type[1].parts[0].after.name).name, False),
-            RecordColumn("tool moved, mm rms", lambda arm_type: f"{1e3 * _moved(arm_type[1]).rms:.3g}"),
-            RecordColumn("σ of that", lambda arm_type: f"{1e3 * _moved(arm_type[1]).expected:.2g}"),
-            RecordColumn("p", lambda arm_type: f"{arm_type[1].geometry.probability:.1g}"),
+            RecordColumn("from", _earlier_folder, False),
+            RecordColumn("to", _later_folder, False),
+            RecordColumn("tool moved, mm rms", _moved_mm),
+            RecordColumn("σ of that", _expected_mm),
+            RecordColumn("p", "{0[1].geometry.probability:.1g}"),
             RecordColumn("", "{0[1].verdict.level}", number=False),
         ]
         blocks: list[Block] = [
-            Text("Notes", lines_of(self.noticed), "note"),
+            Text("Notes", notes_of(self.noticed), "note"),
             table("Arms calibrated more than once", drift, self.changes),
         ]
         for arm_type in self.types:
@@ -110,67 +110,86 @@ class FleetReport(Judged):
         folders.write_staged(out, OURS, self._write)
         for arm_type in self.types:
             if arm_type.parameters:
-                prior.write(out / PRIOR / arm_type.name, [arm.robot for arm in arm_type.plausible], arm_type.parameters)
+                robots = [arm.robot for arm in arm_type.plausible]
+                prior.write(out / PRIOR / arm_type.name, robots, arm_type.parameters)
         return out
 
     def _write(self, folder: Path) -> None:
         from calib.toolkit.report_pages import as_html, report_page
 
-        count = sum(len(arm_type.arms) for arm_type in self.types)
-        files.write(folder / PAGE, as_html(report_page("Fleet", f"{count} arms", (), [self.section()])))
-        arms = []
+        count = 0
+        for arm_type in self.types:
+            count += len(arm_type.arms)
+        page = report_page("Fleet", f"{count} arms", (), [self.section()])
+        files.write(folder / PAGE, as_html(page))
+        rows = []
         for arm_type in self.types:
             usable = [arm.name for arm in arm_type.plausible]
-            arms += [(arm_type.name, arm.name, arm.judged[0], arm.name in usable) for arm in arm_type.arms]
-        files.write_table(folder / ARMS, ARMS_HEADER, arms)
+            rows += [(arm_type.name, arm.name, arm.judged[0], arm.name in usable) for arm in arm_type.arms]
+        files.write_table(folder / ARMS, ARMS_HEADER, rows)
         files.write_json(folder / folders.METRICS, self.to_dict())
 
     def to_dict(self) -> dict[str, object]:
         """Return the numbers as in ``metrics.json`` [SI]."""
-        types = {
-            item.name: {
-                "arms": [calibration.name for calibration in item.arms],
-                "failed": item.failed,
-                "odd": item.odd,
-                "parameters": item.parameters,
-                "tools": item.tools,
+        types = {}
+        for arm_type in self.types:
+            types[arm_type.name] = {
+                "arms": [arm.name for arm in arm_type.arms],
+                "failed": arm_type.failed,
+                "odd": arm_type.odd,
+                "parameters": arm_type.parameters,
+                "tools": arm_type.tools,
             }
-            for item in self.types
+        changes = []
+        for arm, change in self.changes:
+            changes.append({"arm": arm} | change.to_dict())
+        numbers = {
+            "verdict": self.verdict.level,
+            "reason": self.verdict.reason,
+            "types": types,
+            "changes": changes,
+            "noticed": self.noticed,
         }
-        changes = [{"arm": arm} | item.to_dict() for arm, item in self.changes]
-        return plain(
-            {
-                "verdict": self.verdict.level,
-                "reason": self.verdict.reason,
-                "types": types,
-                "changes": changes,
-                "noticed": self.noticed,
-            }
-        )
+        return plain(numbers)
+
+
+def _earlier_folder(row: tuple[str, RobotChange]) -> str:
+    return Path(row[1].parts[0].before.name).name
+
+
+def _later_folder(row: tuple[str, RobotChange]) -> str:
+    return Path(row[1].parts[0].after.name).name
+
+
+def _moved_mm(row: tuple[str, RobotChange]) -> str:
+    return f"{1e3 * _tool_motion(row[1]).rms:.3g}"
+
+
+def _expected_mm(row: tuple[str, RobotChange]) -> str:
+    return f"{1e3 * _tool_motion(row[1]).expected:.2g}"
 
 
 def _tables(arm_type: ArmType) -> list[Block]:
-    def cell(name: str) -> RecordColumn:
-        return RecordColumn(name, lambda row: small(getattr(row, name), row.unit, 3))
-
     parameters = [
         RecordColumn("parameter", "{0.name}", number=False),
         RecordColumn("arms", "{0.arms}"),
-        *map(cell, ("mean", "sigma", "width")),
+        RecordColumn("mean", lambda row: small(row.mean, row.unit, 3)),
+        RecordColumn("sigma", lambda row: small(row.sigma, row.unit, 3)),
+        RecordColumn("width", lambda row: small(row.width, row.unit, 3)),
     ]
     tool_columns = [
         RecordColumn("tool", "{0.tool}", number=False),
-        RecordColumn("arms", lambda row: f"{len(row.arms)}"),
-        RecordColumn("from the others' mm", lambda row: f"{1e3 * row.moved:.3g}"),
+        RecordColumn("arms", _arm_count),
+        RecordColumn("from the others' mm", _displacement_mm),
         RecordColumn("σ", "{0.moved_sigmas:.1f}"),
         RecordColumn("error, times the others'", "{0.times:.3g}"),
-        RecordColumn("σ ", lambda row: f"{row.times_sigmas:.1f}" if row.times > MIN_TIMES else ""),
+        RecordColumn("σ ", _error_sigmas),
     ]
     arms = [
-        RecordColumn("arm", lambda row: row.serial or row.name, number=False),
+        RecordColumn("arm", _serial_or_name, number=False),
         RecordColumn("calibrated", "{0.name}", number=False),
         RecordColumn("verdict", "{0.judged[0]}", number=False),
-        RecordColumn("rms mm", lambda row: f"{1e3 * row.left:.3g}"),
+        RecordColumn("rms mm", _residual_mm),
     ]
     note = "Deviations from nominal; the next arm is expected within width of the mean."
     compared = [row for row in arm_type.tools if row.moved is not None]
@@ -179,6 +198,31 @@ def _tables(arm_type: ArmType) -> list[Block]:
         table(f"Tools of {arm_type.name}", tool_columns, compared),
         table(f"Parameters of {arm_type.name}", parameters, arm_type.parameters, note),
     ]
+
+
+def _arm_count(row: ToolUse) -> str:
+    return f"{len(row.arms)}"
+
+
+def _displacement_mm(row: ToolUse) -> str:
+    assert row.moved is not None
+    return f"{1e3 * row.moved:.3g}"
+
+
+def _error_sigmas(row: ToolUse) -> str:
+    """Return how sure a larger error is; empty for a tool whose error is about that of the others."""
+    assert row.times is not None
+    if row.times > MIN_TIMES:
+        return f"{row.times_sigmas:.1f}"
+    return ""
+
+
+def _serial_or_name(arm: Calibration) -> str:
+    return arm.serial or arm.name
+
+
+def _residual_mm(arm: Calibration) -> str:
+    return f"{1e3 * arm.residual_rms:.3g}"
 
 
 @checked
@@ -196,36 +240,45 @@ def report_fleet(calibrations: str | Path | Sequence[str | Path]) -> FleetReport
         UsageError: for a folder that holds no fit, or one given twice; where unfinished sessions leave one or none.
     """
     fleet_visits = visits(calibrations)
-    by_arm = fleet_visits.by_arm
-    usable = {
-        arm: [calibration for calibration in calibrations_of_arm if not _failed(calibration)]
-        for arm, calibrations_of_arm in by_arm.items()
-    }
-    changes = [
-        (arm, diff(calibration.name, later.name))
-        for arm, calibrations_of_arm in usable.items()
-        for calibration, later in pairwise(calibrations_of_arm)
-    ]
+    changes: list[tuple[str, RobotChange]] = []
     types: list[list[Calibration]] = []
-    for calibrations_of_arm in by_arm.values():
-        alike = next((arms for arms in types if _same(arms[0], calibrations_of_arm[-1])), None)
-        if alike is None:
-            types.append(alike := [])
-        alike.append(calibrations_of_arm[-1])
+    earlier_failures = []
+    failed_count = 0
+    for serial, visits_of_arm in fleet_visits.by_arm.items():
+        sound = [calibration for calibration in visits_of_arm if not _failed(calibration)]
+        for before, after in pairwise(sound):
+            changes.append((serial, diff(before.name, after.name)))
+        latest = visits_of_arm[-1]
+        _arms_of_type(types, latest).append(latest)
+        earlier_failures += [_failure(calibration, 0.0) for calibration in visits_of_arm[:-1] if _failed(calibration)]
+
     names = [arms[0].chain.name for arms in types]
-    labels = [name if names.count(name) == 1 else f"{name}_{k + 1}" for k, name in enumerate(names)]
-    arm_types = tuple(_arm_type(label, arms) for label, arms in zip(labels, types))
-    earlier = [
-        _failure(calibration, 0.0)
-        for calibrations_of_arm in by_arm.values()
-        for calibration in calibrations_of_arm[:-1]
-        if _failed(calibration)
-    ]
-    noticed = settle([*fleet_visits.noticed, *_findings(arm_types, changes), *earlier])
-    failed = sum(len(calibration.failed) for calibration in arm_types)
-    parts = [f"{counted(len(by_arm), 'arm')} of {counted(len(arm_types), 'type')}", failed and f"{failed} failed"]
-    summary = ", ".join(filter(None, [*parts, f"{len(changes)} calibrated again"]))
-    return FleetReport(arm_types, tuple(changes), noticed, Verdict.of(summary, noticed))
+    arm_types = []
+    for k, (name, arms) in enumerate(zip(names, types)):
+        label = name
+        if names.count(name) > 1:
+            label = f"{name}_{k + 1}"
+        arm_type = _arm_type(label, arms)
+        failed_count += len(arm_type.failed)
+        arm_types.append(arm_type)
+
+    noticed = settle([*fleet_visits.noticed, *_findings(arm_types, changes), *earlier_failures])
+    parts = [f"{counted(len(fleet_visits.by_arm), 'arm')} of {counted(len(arm_types), 'type')}"]
+    if failed_count:
+        parts.append(f"{failed_count} failed")
+    parts.append(f"{len(changes)} calibrated again")
+    verdict = Verdict.of(", ".join(parts), noticed)
+    return FleetReport(tuple(arm_types), tuple(changes), noticed, verdict)
+
+
+def _arms_of_type(types: list[list[Calibration]], calibration: Calibration) -> list[Calibration]:
+    """Return the arms of the same nominal description; a new list at the end of `types` where there are none yet."""
+    for arms in types:
+        with suppress(RobotError):
+            check_same_robot((arms[0].name, calibration.name), (arms[0].robot, calibration.robot))
+            return arms
+    types.append([])
+    return types[-1]
 
 
 def _failed(calibration: Calibration) -> bool:
@@ -237,68 +290,60 @@ def _failure(calibration: Calibration, share: float) -> Finding:
     return finding("arm-failed", arm=calibration.name, reason=calibration.judged[1], share=share)
 
 
-def _same(first: Calibration, second: Calibration) -> bool:
-    with suppress(RobotError):
-        check_same_robot((first.name, second.name), (first.robot, second.robot))
-        return True
-    return False
-
-
 def _arm_type(name: str, arms: Sequence[Calibration]) -> ArmType:
-    failed = tuple(calibration.name for calibration in arms if _failed(calibration))
-    odd = tuple(
-        calibration.name for calibration in arms if calibration.name not in failed and _farthest(calibration)[1] > 1.0
-    )
-    sound = [
-        calibration.robot
-        for calibration in arms
-        if calibration.name not in (*failed, *odd) and calibration.robot.covariance is not None
-    ]
-    tool_uses = {
-        calibration.name: (calibration.cell.tool_names[0], calibration.cell.tools[0][:3, 3], calibration.left)
-        for calibration in arms
-    }
-    return ArmType(name, tuple(arms), failed, odd, prior.spread(sound) if sound else (), tuple(tools(tool_uses)))
+    failed: list[str] = []
+    odd: list[str] = []
+    robots = []
+    tool_uses = {}
+    for arm in arms:
+        tool_uses[arm.name] = (arm.cell.tool_names[0], arm.cell.tools[0][:3, 3], arm.residual_rms)
+        if _failed(arm):
+            failed.append(arm.name)
+        elif _farthest(arm)[1] > 1.0:
+            odd.append(arm.name)
+        elif arm.robot.covariance is not None:
+            robots.append(arm.robot)
+    parameters: tuple[ParameterSpread, ...] = ()
+    if robots:
+        parameters = prior.spread(robots)
+    return ArmType(name, tuple(arms), tuple(failed), tuple(odd), parameters, tuple(tools(tool_uses)))
 
 
 def _farthest(calibration: Calibration) -> tuple[str, float]:
     """Return the parameter farthest from nominal, and how far in what is plausible (`PLAUSIBLE`)."""
     nominal = calibration.robot.nominal or calibration.chain
-    sizes = np.abs(calibration.chain.values - nominal.values) / [PLAUSIBLE[unit] for unit in nominal.units]
+    plausible = [PLAUSIBLE[unit] for unit in nominal.units]
+    sizes = np.abs(calibration.chain.values - nominal.values) / plausible
     k = int(sizes.argmax())
     return nominal.names[k], float(sizes[k])
 
 
-def _moved(change: RobotChange) -> ToolMotion:
+def _tool_motion(change: RobotChange) -> ToolMotion:
     assert change.geometry is not None
     return change.geometry.motions[0]
 
 
 def _findings(types: Sequence[ArmType], changes: Sequence[tuple[str, RobotChange]]) -> list[Finding]:
-    findings = [
-        finding("arm-drifts", arm=arm, moved=_moved(arm_type).rms, reason=arm_type.verdict.reason)
-        for arm, arm_type in changes
-        if arm_type.verdict.level in ("marginal", "fail")
-    ]
+    findings = []
+    for serial, change in changes:
+        if change.verdict.level in ("marginal", "fail"):
+            moved = _tool_motion(change).rms
+            findings.append(finding("arm-drifts", arm=serial, moved=moved, reason=change.verdict.reason))
     for arm_type in types:
-        findings += [
-            _failure(arm, len(arm_type.failed) / len(arm_type.arms))
-            for arm in arm_type.arms
-            if arm.name in arm_type.failed
-        ]
-        findings += [
-            finding("arm-marginal", arm=arm.name, reason=arm.judged[1])
-            for arm in arm_type.arms
-            if arm.judged[0] == "marginal"
-        ]
+        share = len(arm_type.failed) / len(arm_type.arms)
+        findings += [_failure(arm, share) for arm in arm_type.arms if arm.name in arm_type.failed]
+        for arm in arm_type.arms:
+            if arm.judged[0] == "marginal":
+                findings.append(finding("arm-marginal", arm=arm.name, reason=arm.judged[1]))
+        # one name for the tools of so many arms: the fits were not told which tool is which
         if len(arm_type.tools) == 1 and len(arm_type.arms) >= sum(MIN_ARMS):
-            at = np.array([arm.cell.tools[0][:3, 3] for arm in arm_type.plausible or arm_type.arms])
-            away = np.linalg.norm(at - np.median(at, axis=0), axis=1).max()
-            findings.append(finding("tools-unnamed", type=arm_type.name, tool=arm_type.tools[0].tool, away=away))
-        findings += [
-            finding("unlike-its-type", arm=arm.name, name=_farthest(arm)[0])
-            for arm in arm_type.arms
-            if arm.name in arm_type.odd
-        ]
-        findings += [tool_finding for tool in arm_type.tools for tool_finding in tool.findings()]
+            positions = np.array([arm.cell.tools[0][:3, 3] for arm in arm_type.plausible or arm_type.arms])
+            distances = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
+            tool = arm_type.tools[0].tool
+            findings.append(finding("tools-unnamed", type=arm_type.name, tool=tool, away=distances.max()))
+        for arm in arm_type.arms:
+            if arm.name in arm_type.odd:
+                findings.append(finding("unlike-its-type", arm=arm.name, name=_farthest(arm)[0]))
+        for tool in arm_type.tools:
+            findings += tool.findings()
     return findings

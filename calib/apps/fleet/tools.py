@@ -8,12 +8,18 @@ from scipy import stats
 
 from calib.errors import Finding, finding
 
-MIN_ARMS = 2, 3  # with the tool, and with others, that a comparison needs (our choice)
-SIGMAS = 2.6  # between medians, above it a tool is named: 99 %, as of other findings
-FAR = 3.0  # times the typical distance from the median, which larger ones count as (our choice)
-WORTH = 0.8  # share of the degrees of freedom that is left by that (our choice)
-MIN_SCATTER = 1e-6  # [m, or of a logarithm]
-MIN_TIMES = 1.5  # of the others' error, below it a tool is not called loose (our choice)
+# with the tool, and with others, that a comparison needs (our choice)
+MIN_ARMS = 2, 3
+# between medians, above it a tool is named: 99 %, as of other findings
+SIGMAS = 2.6
+# times the typical distance from the median, which larger ones count as (our choice)
+MAX_DISTANCE = 3.0
+# share of the degrees of freedom that remains by that (our choice)
+FREEDOM_SHARE = 0.8
+# [m, or of a logarithm]
+MIN_SCATTER = 1e-6
+# of the others' error, below it a tool is not called loose (our choice)
+MIN_TIMES = 1.5
 
 
 @dataclass(frozen=True)
@@ -38,8 +44,11 @@ class ToolUse:
 
     def findings(self) -> list[Finding]:
         """Return that the tool is bent, or loose."""
-        bent = self.moved if (self.moved_sigmas or 0.0) > SIGMAS else None
-        loose = self.times if (self.times_sigmas or 0.0) > SIGMAS and (self.times or 0.0) > MIN_TIMES else None
+        bent = loose = None
+        if self.moved_sigmas is not None and self.moved_sigmas > SIGMAS:
+            bent = self.moved
+        if self.times_sigmas is not None and self.times_sigmas > SIGMAS and (self.times or 0.0) > MIN_TIMES:
+            loose = self.times
         if bent is None and loose is None:
             return []
         return [finding("bad-tool", tool=self.tool, arms=self.arms, moved=bent, times=loose)]
@@ -49,29 +58,38 @@ def tools(tool_uses: Mapping[str, tuple[str, np.ndarray, float]]) -> list[ToolUs
     """Return what each tool's arms show.
 
     Args:
-        used: arm → (tool, its position (3,) in the tip's frame [m], rms error of the calibrated arm [m]).
+        tool_uses: arm → (tool, its position (3,) in the tip's frame [m], rms error of the calibrated arm [m]).
     """
     names = sorted({tool for tool, _, _ in tool_uses.values()})
     return [_use(name, tool_uses) for name in names]
 
 
 def _use(name: str, tool_uses: Mapping[str, tuple[str, np.ndarray, float]]) -> ToolUse:
-    arms = tuple(arm for arm, (tool, _, _) in tool_uses.items() if tool == name)
-    other_arms = [arm for arm in tool_uses if arm not in arms]
+    arms = []
+    other_arms = []
+    for arm, (tool, _, _) in tool_uses.items():
+        if tool == name:
+            arms.append(arm)
+        else:
+            other_arms.append(arm)
     if len(arms) < MIN_ARMS[0] or len(other_arms) < MIN_ARMS[1]:
-        return ToolUse(name, arms)
-    groups = (arms, other_arms)
-    positions = [np.array([tool_uses[arm][1] for arm in group]) for group in groups]
-    errors = [np.log([[max(tool_uses[arm][2], 1e-9)] for arm in group]) for group in groups]
+        return ToolUse(name, tuple(arms))
+
+    positions = []
+    log_errors = []
+    for group in (arms, other_arms):
+        positions.append(np.array([tool_uses[arm][1] for arm in group]))
+        # an error of zero has no logarithm
+        log_errors.append(np.log([[max(tool_uses[arm][2], 1e-9)] for arm in group]))
     displacement = np.median(positions[0], axis=0) - np.median(positions[1], axis=0)
-    log_ratio = np.median(errors[0], axis=0) - np.median(errors[1], axis=0)
+    log_ratio = np.median(log_errors[0], axis=0) - np.median(log_errors[1], axis=0)
     return ToolUse(
         tool=name,
-        arms=arms,
+        arms=tuple(arms),
         moved=float(np.linalg.norm(displacement)),
         moved_sigmas=_sigmas(displacement, positions),
         times=float(np.exp(log_ratio[0])),
-        times_sigmas=float(np.copysign(_sigmas(log_ratio, errors), log_ratio[0])),
+        times_sigmas=float(np.copysign(_sigmas(log_ratio, log_errors), log_ratio[0])),
     )
 
 
@@ -81,10 +99,19 @@ def _sigmas(step: np.ndarray, groups: Sequence[np.ndarray]) -> float:
     The scatter is that of the arms (n, k) about the median of their own group, as if all of it were along the
     difference: a tool's position scatters most along the last axis, where it cannot be told from the arm's last link.
     """
-    away = [np.sort(np.linalg.norm(group - np.median(group, axis=0), axis=1)) for group in groups]
-    typical = np.median(np.concatenate([group[1:] for group in away]))  # without the arm that is the median itself
-    freedom = sum(len(group) - 1 for group in groups)
-    variance = np.sum(np.minimum(np.concatenate(away), FAR * typical) ** 2) / freedom
-    of_medians = sum(np.pi / (2.0 * (len(group) - 1) + np.pi) for group in groups)  # in variances of one arm, if normal
-    square = float(step @ step) / max(variance, MIN_SCATTER**2) / of_medians
-    return float(stats.norm.isf(max(stats.f.sf(square, 1, WORTH * freedom), 1e-300) / 2.0))
+    distances = []
+    freedom = 0
+    variance_of_medians = 0.0
+    for group in groups:
+        deviations = group - np.median(group, axis=0)
+        distances.append(np.sort(np.linalg.norm(deviations, axis=1)))
+        freedom += len(group) - 1
+        # in variances of one arm, if normal
+        variance_of_medians += np.pi / (2.0 * (len(group) - 1) + np.pi)
+    # without the arm that is the median itself
+    typical = np.median(np.concatenate([group[1:] for group in distances]))
+    limited = np.minimum(np.concatenate(distances), MAX_DISTANCE * typical)
+    variance = np.sum(limited**2) / freedom
+    square = float(step @ step) / max(variance, MIN_SCATTER**2) / variance_of_medians
+    probability = max(stats.f.sf(square, 1, FREEDOM_SHARE * freedom), 1e-300)
+    return float(stats.norm.isf(probability / 2.0))

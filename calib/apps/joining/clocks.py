@@ -297,6 +297,8 @@ def fitted(
     loss = "none" if backlash else "huber"
     middle_time = run.stream.t[rows] - clock.middle
     spread = np.full(len(guess), np.inf)
+    matrix, target = np.zeros((0, len(guess))), np.zeros(0)
+    offset_slopes, backlash_slopes = list[np.ndarray](), list[np.ndarray]()
     for _ in range(ROUNDS):
         # the prior's mean minus the present values
         pulled = np.zeros(len(guess))

@@ -121,6 +121,7 @@ def _refined(
     chain: Chain, q: np.ndarray, points: np.ndarray, pose: np.ndarray, limit: float, prefer: np.ndarray | None = None
 ) -> Order | None:
     """Return the order that a first order leads to, None if most of the points then belong to no pose."""
+    cost = np.full((len(points), len(q)), np.inf)
     for _ in range(MAX_ROUNDS):
         assigned = np.flatnonzero(pose >= 0)
         if len(assigned) < MIN_POINTS:

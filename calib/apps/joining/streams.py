@@ -275,7 +275,7 @@ def _target() -> Kind:
         if not turn.size:
             return sound_rows
         norm_error = np.abs(np.linalg.norm(turn, axis=1) - 1.0)
-        return sound_rows & (norm_error <= BOUNDS.max_norm_error)
+        return np.asarray(sound_rows & (norm_error <= BOUNDS.max_norm_error))
 
     def refuse(table: Table, values: np.ndarray) -> None:
         POSITION.check(values[:, :3], table, names(table)[:3])

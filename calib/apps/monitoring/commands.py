@@ -76,5 +76,6 @@ def _shown(outcome: Any, out: Path | None, plots: bool, result: bool = False) ->
     if out is not None:
         outcome.save(out, plots=plots)
     say(*outcome.renderables(), result=result)
-    say(*([f"written to {out}"] if out else []))
+    if out is not None:
+        say(f"written to {out}")
     exit_failed(outcome.section().verdict)

@@ -21,8 +21,8 @@ from calib.toolkit.result_folders import (
     ChartedResult,
     Judged,
     Verdict,
-    lines_of,
     load_robot,
+    notes_of,
     read_measured_file,
     settle,
 )
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from calib.toolkit.report_charts import Chart
 
 TABLE = "trends.csv"
+HEADER = ("column", "unit", "x", "dx [mm]", "dy [mm]", "dz [mm]")
+CAPTION = "Targets of repeated poses less the arm's prediction."
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +66,13 @@ class DriftFound(ChartedResult, Judged):
             RecordColumn("poses", "{0.poses}"),
             RecordColumn("visits", "{0.x.size}"),
             RecordColumn("slope", _rate),
-            *(RecordColumn(f"{axis} mm", _of_axis(k)) for k, axis in enumerate("xyz")),
+            RecordColumn("x mm", lambda trend: f"{1e3 * trend.slope[0]:+.2g}"),
+            RecordColumn("y mm", lambda trend: f"{1e3 * trend.slope[1]:+.2g}"),
+            RecordColumn("z mm", lambda trend: f"{1e3 * trend.slope[2]:+.2g}"),
             RecordColumn("in all mm", lambda trend: f"{1e3 * trend.total:.3g}"),
             RecordColumn("σ", lambda trend: f"{trend.sigmas:.1f}"),
         ]
-        blocks = [Text("Notes", lines_of(self.noticed), "note"), table("Drift of the target", columns, self.trends)]
+        blocks = [Text("Notes", notes_of(self.noticed), "note"), table("Drift of the target", columns, self.trends)]
         return Section("Drift", blocks, self.verdict.level, self.verdict.reason)
 
     def charts(self) -> dict[str, Chart]:
@@ -79,26 +83,24 @@ class DriftFound(ChartedResult, Judged):
         for trend in self.trends:
             ends = np.array([trend.x.min(), trend.x.max()])
             for k, axis in enumerate("xyz"):
-                drawn = 1e3 * trend.slope[k] * (ends - trend.x.mean())
-                layers = [line(trend.x, 1e3 * trend.moved[:, k], "o", AFTER), line(ends, drawn, "-", QUIET)]
-                panels.append(Panel(layers, f"{axis} [mm]", f"{trend.what} [{trend.unit}]"))
-        return {"drift": Chart(panels, 2.2 * len(self.trends), 3)} if panels else {}
+                motion = line(trend.x, 1e3 * trend.moved[:, k], "o", AFTER)
+                slope = line(ends, 1e3 * trend.slope[k] * (ends - trend.x.mean()), "-", QUIET)
+                panels.append(Panel([motion, slope], f"{axis} [mm]", f"{trend.what} [{trend.unit}]"))
+        if not panels:
+            return {}
+        return {"drift": Chart(panels, 2.2 * len(self.trends), 3)}
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write a folder: report.html, trends.csv, metrics.json, and the figure as PNG."""
-        header = ("column", "unit", "x", "dx [mm]", "dy [mm]", "dz [mm]")
-        rows = [
-            (trend.what, trend.unit, x, *(1e3 * displacement))
-            for trend in self.trends
-            for x, displacement in zip(trend.x, trend.moved)
-        ]
-        part = pages.ResultPart(
-            self.section(),
-            self.charts() if plots else {},
-            ["Targets of repeated poses less the arm's prediction."],
-            (TABLE, header, rows),
-        )
+        rows: list[tuple[object, ...]] = []
+        for trend in self.trends:
+            for x, displacement in zip(trend.x, trend.moved):
+                rows.append((trend.what, trend.unit, x, *(1e3 * displacement)))
+        charts: dict[str, Chart] = {}
+        if plots:
+            charts = self.charts()
+        part = pages.ResultPart(self.section(), charts, [CAPTION], (TABLE, HEADER, rows))
         verdict = self.verdict
         numbers: dict[str, object] = {
             "robot": self.robot,
@@ -121,10 +123,6 @@ def _rate(trend: Trend) -> str:
     return f"{1e3 * trend.size:.2g} ± {1e3 * trend.sigma:.1g} mm/{trend.unit}"
 
 
-def _of_axis(k: int):
-    return lambda trend: f"{1e3 * trend.slope[k]:+.2g}"
-
-
 def drift(
     robot: str | Path,
     measured: Sequence[str | Path],
@@ -145,16 +143,23 @@ def drift(
     Raises:
         UsageError: where no pose was measured twice.
     """
-    chosen = (
-        options if isinstance(options, FitOptions) else read_fit_options(None if options is None else Path(options))
-    )
-    chain = load_robot(robot, None, chosen, base=base, tip=tip)[0]
-    blocks = [block for path in measured for block in read_measured_file(Path(path), chain, chosen)]
-    repeat_findings = repeats(chain, blocks[:1], blocks[1:], settings.sigma or 0.0)
-    trends_found = tuple(trends(chain, blocks[:1], blocks[1:], settings.sigma or 0.0))
+    if isinstance(options, FitOptions):
+        fit_options = options
+    elif options is None:
+        fit_options = read_fit_options(None)
+    else:
+        fit_options = read_fit_options(Path(options))
+    chain = load_robot(robot, None, fit_options, base=base, tip=tip)[0]
+    blocks = []
+    for path in measured:
+        blocks += read_measured_file(Path(path), chain, fit_options)
+
+    first, later = blocks[:1], blocks[1:]
+    sigma = settings.sigma or 0.0
+    findings = list(repeats(chain, first, later, sigma))
+    drifts = tuple(trends(chain, first, later, sigma))
     message = "no pose was measured twice: measure the first poses again at the end, into the same or a further file"
-    require(repeat_findings or trends_found, message, UsageError)
-    need = settings.tolerance or noise_of_difference(settings.sigma or 0.0)
-    return DriftFound(
-        chain.name, trends_found, settle([*repeat_findings, *(trend.finding(need) for trend in trends_found)])
-    )
+    require(findings or drifts, message, UsageError)
+    need = settings.tolerance or noise_of_difference(sigma)
+    findings += [trend.finding(need) for trend in drifts]
+    return DriftFound(chain.name, drifts, settle(findings))

@@ -17,14 +17,15 @@ from calib.apps.monitoring.comparison.robot_change import diff
 from calib.errors import SessionError, UsageError, command_line, require
 from calib.records import plain
 from calib.result_kinds import BY_NAME
-from calib.toolkit.opened_results import Unjudged
 from calib.toolkit.report_pages import RecordColumn, Section, table
-from calib.toolkit.result_folders import ChartedResult, Judged
+from calib.toolkit.result_folders import ChartedResult, Judged, Unjudged
 from calib.toolkit.sessions import Session, folders_of, open_session, position_errors, torque_error
 
 if TYPE_CHECKING:
     from calib.toolkit.report_charts import Chart
 
+# where a calibration states no error, or no motion of the tool
+NOT_KNOWN = (np.nan, np.nan)
 TABLE = "log.csv"
 HEADER = (
     "folder",
@@ -66,30 +67,35 @@ class LogLine:
     @property
     def moved(self) -> tuple[float, float] | None:
         """How far the tool moved since the line before, rms, and what σ lets expect [mm]."""
-        motion = self.change and self.change.motions[0]
-        return (1e3 * motion.rms, 1e3 * motion.expected) if motion else None
+        if self.change is None:
+            return None
+        motion = self.change.motions[0]
+        return 1e3 * motion.rms, 1e3 * motion.expected
 
     @property
     def first(self) -> ParameterChange | None:
         """The parameter that explains most of the change, where something changed."""
-        return self.change.parameters[0] if self.change and self.change.changed else None
+        if self.change is None or not self.change.changed:
+            return None
+        return self.change.parameters[0]
 
     @property
     def parameter(self) -> str:
         """That parameter with its change and σ."""
         change = self.first
-        return f"{change.name} {plus_minus(change.alone, change.alone_sigma, change.unit)}" if change else ""
+        if change is None:
+            return ""
+        return f"{change.name} {plus_minus(change.alone, change.alone_sigma, change.unit)}"
 
     def row(self, robot: str) -> tuple[object, ...]:
         """Return the cells of `HEADER`."""
-        parameter = self.first
-        change = (
-            (parameter.name, parameter.alone, parameter.alone_sigma, parameter.unit)
-            if parameter
-            else ("", None, None, "")
-        )
-        errors, motion = self.errors or (None, None), self.moved or (None, None)
-        return self.folder, self.date, robot, self.serial, self.verdict, *errors, self.torque, *motion, *change
+        nominal, calibrated = self.errors or (None, None)
+        motion, sigma = self.moved or (None, None)
+        change: tuple[object, ...] = ("", None, None, "")
+        if self.first:
+            change = (self.first.name, self.first.alone, self.first.alone_sigma, self.first.unit)
+        session = (self.folder, self.date, robot, self.serial, self.verdict)
+        return (*session, nominal, calibrated, self.torque, motion, sigma, *change)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,14 +111,14 @@ class RobotLog(ChartedResult, Judged, Unjudged):
     def section(self) -> Section:
         """Return a report section with a line per calibration."""
         columns = [
-            *(RecordColumn(name, f"{{0.{name}}}", number=False) for name in ("date", "folder", "serial", "verdict")),
-            RecordColumn("nominal mm", lambda log_line: f"{log_line.errors[0]:.3g}" if log_line.errors else ""),
-            RecordColumn("calibrated mm", lambda log_line: f"{log_line.errors[1]:.3g}" if log_line.errors else ""),
-            RecordColumn("torque %", lambda log_line: "" if log_line.torque is None else f"{log_line.torque:.3g}"),
-            RecordColumn(
-                "tool moved mm",
-                lambda log_line: f"{log_line.moved[0]:.3g} (σ {log_line.moved[1]:.2g})" if log_line.moved else "",
-            ),
+            RecordColumn("date", "{0.date}", number=False),
+            RecordColumn("folder", "{0.folder}", number=False),
+            RecordColumn("serial", "{0.serial}", number=False),
+            RecordColumn("verdict", "{0.verdict}", number=False),
+            RecordColumn("nominal mm", _nominal_error),
+            RecordColumn("calibrated mm", _calibrated_error),
+            RecordColumn("torque %", _torque_error),
+            RecordColumn("tool moved mm", _motion),
             RecordColumn("most by", "{0.parameter}", number=False),
         ]
         return Section("Log", [table(f"Calibrations of {self.robot}", columns, self.lines)])
@@ -121,31 +127,63 @@ class RobotLog(ChartedResult, Judged, Unjudged):
         """Return what the figure shows: errors of each calibration, and the tool's motion since the one before."""
         from calib.toolkit.report_charts import AFTER, BEFORE, Chart, Panel, line
 
-        dates, panels = [log_line.date for log_line in self.lines], []
-        values = {
-            "error on unseen poses [mm]": [
-                log_line.errors[1] if log_line.errors else np.nan for log_line in self.lines
-            ],
-            "the tool moved since the one before [mm]": [
-                log_line.moved[0] if log_line.moved else np.nan for log_line in self.lines
-            ],
-        }
-        expected = [log_line.moved[1] if log_line.moved else np.nan for log_line in self.lines]
-        for title, series in values.items():
-            layers = [line(range(len(series)), series, "o-", AFTER, label="found")]
-            if "moved" in title:
-                layers.append(line(range(len(series)), expected, "+", BEFORE, label="σ lets expect"))
-            panels.append(Panel(layers, title, xnames=dates))
+        errors = []
+        motions = []
+        expected = []
+        for log_line in self.lines:
+            errors.append((log_line.errors or NOT_KNOWN)[1])
+            motion = log_line.moved or NOT_KNOWN
+            motions.append(motion[0])
+            expected.append(motion[1])
+        dates = [log_line.date for log_line in self.lines]
+        numbers = range(len(dates))
+        errors_drawn = [line(numbers, errors, "o-", AFTER, label="found")]
+        motion_drawn = [
+            line(numbers, motions, "o-", AFTER, label="found"),
+            line(numbers, expected, "+", BEFORE, label="σ lets expect"),
+        ]
+        panels = [
+            Panel(errors_drawn, "error on unseen poses [mm]", xnames=dates),
+            Panel(motion_drawn, "the tool moved since the one before [mm]", xnames=dates),
+        ]
         return {"log": Chart(panels, 2.6, 2)}
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write a folder: report.html, log.csv, metrics.json, and the figure as PNG."""
+        charts: dict[str, Chart] = {}
+        if plots:
+            charts = self.charts()
         rows = [log_line.row(self.robot) for log_line in self.lines]
-        charts = self.charts() if plots else {}
         part = pages.ResultPart(self.section(), charts, ["Errors, and motion of the tool."], (TABLE, HEADER, rows))
-        numbers = plain({"robot": self.robot, "lines": [dict(zip(HEADER, row)) for row in rows]})
-        setup = {"robot": self.robot}
-        return pages.save(Path(out), "log", f"Calibrations of {self.robot}", setup, [part], numbers, [TABLE])
+        lines = [dict(zip(HEADER, row)) for row in rows]
+        numbers = plain({"robot": self.robot, "lines": lines})
+        title = f"Calibrations of {self.robot}"
+        return pages.save(Path(out), "log", title, {"robot": self.robot}, [part], numbers, [TABLE])
+
+
+def _nominal_error(log_line: LogLine) -> str:
+    if log_line.errors is None:
+        return ""
+    return f"{log_line.errors[0]:.3g}"
+
+
+def _calibrated_error(log_line: LogLine) -> str:
+    if log_line.errors is None:
+        return ""
+    return f"{log_line.errors[1]:.3g}"
+
+
+def _torque_error(log_line: LogLine) -> str:
+    if log_line.torque is None:
+        return ""
+    return f"{log_line.torque:.3g}"
+
+
+def _motion(log_line: LogLine) -> str:
+    if log_line.moved is None:
+        return ""
+    motion, sigma = log_line.moved
+    return f"{motion:.3g} (σ {sigma:.2g})"
 
 
 def log(folders: Sequence[str | Path], *, mixed: bool = False) -> RobotLog:
@@ -160,35 +198,45 @@ def log(folders: Sequence[str | Path], *, mixed: bool = False) -> RobotLog:
         RobotError: where their nominal geometries differ.
         SessionError: for a session that has not come to a verdict.
     """
-    sessions = sorted(
-        (open_session(Path(path)) for path in folders_of(folders)), key=lambda session: session.settings.created
-    )
-    for attribute, of in (("robots", lambda session: session.settings.name), ("serial numbers", _serial)):
-        names = list(dict.fromkeys(filter(None, map(of, sessions))))
-        message = f"the sessions are of other {attribute} ({', '.join(names)}); --mixed takes them for one robot"
-        require(len(names) < 2 or mixed, message, UsageError)
+    sessions = [open_session(Path(path)) for path in folders_of(folders)]
+    sessions.sort(key=_created)
+    _check_same("robots", [session.settings.name for session in sessions], mixed)
+    _check_same("serial numbers", [_serial(session) for session in sessions], mixed)
     for session in sessions:
         finished = session.concluded
         message = f"{session.folder} has no verdict yet: {command_line('next', session.folder)}"
         require(finished, message, SessionError)
-    lines, last = list[LogLine](), None
+
+    lines = []
+    last_fitted: Path | None = None
     for session in sessions:
         change = None
-        if session.fit.numbers.exists() and session.geometric:
-            change = last and diff(last, session.folder).geometry
-            last = session.folder
-        lines.append(
-            LogLine(
-                str(session.folder),
-                session.settings.created[:10],
-                _serial(session),
-                session.verdicts().level,
-                position_errors(session),
-                torque_error(session),
-                change or None,
-            )
+        if session.geometric and session.fit.numbers.exists():
+            if last_fitted:
+                change = diff(last_fitted, session.folder).geometry
+            last_fitted = session.folder
+        line = LogLine(
+            folder=str(session.folder),
+            date=_created(session)[:10],
+            serial=_serial(session),
+            verdict=session.verdicts().level,
+            errors=position_errors(session),
+            torque=torque_error(session),
+            change=change,
         )
+        lines.append(line)
     return RobotLog(sessions[-1].settings.name, tuple(lines))
+
+
+def _check_same(attribute: str, names: Sequence[str], mixed: bool) -> None:
+    """Refuse sessions that state several names, unless they are to be mixed; sessions without one go with all."""
+    different = list(dict.fromkeys(name for name in names if name))
+    message = f"the sessions are of other {attribute} ({', '.join(different)}); --mixed takes them for one robot"
+    require(len(different) < 2 or mixed, message, UsageError)
+
+
+def _created(session: Session) -> str:
+    return session.settings.created
 
 
 def _serial(session: Session) -> str:

@@ -1,4 +1,4 @@
-"""Folder of a result of this room: report.html with its figures, tables, metrics.json."""
+"""Folder of a comparison, a drift or a log: report.html with its figures, tables, metrics.json."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from calib.toolkit.report_pages import Pictures, Section
 if TYPE_CHECKING:
     from calib.toolkit.report_charts import Chart
 
-PAGE, PICTURE = "report.html", "plot_{}.png"
+PAGE = "report.html"
+PICTURE = "plot_{}.png"
 
 
 class ResultPart(NamedTuple):
@@ -48,15 +49,18 @@ def _write(folder: Path, title: str, setup: Mapping[str, str], parts: Sequence[R
     from calib.toolkit.report_charts import picture
     from calib.toolkit.report_pages import Entry, as_html, report_page
 
-    sections = list[Section]()
+    sections = []
     for part in parts:
-        drawn = {name: picture(chart, caption) for (name, chart), caption in zip(part.charts.items(), part.captions)}
-        for name, drawing in drawn.items():
+        drawings = []
+        for (name, chart), caption in zip(part.charts.items(), part.captions):
+            drawing = picture(chart, caption)
             files.write(folder / PICTURE.format(name), drawing.image)
-        blocks = [*part.section.blocks, Pictures("", list(drawn.values()))]
+            drawings.append(drawing)
+        blocks = [*part.section.blocks, Pictures("", drawings)]
         sections.append(replace(part.section, blocks=blocks))
         name, header, rows = part.table
         files.write_table(folder / name, header, rows)
     entries = [Entry(*fields) for fields in setup.items()]
-    files.write(folder / PAGE, as_html(report_page(title, " to ".join(setup.values()), entries, sections)))
+    page = report_page(title, " to ".join(setup.values()), entries, sections)
+    files.write(folder / PAGE, as_html(page))
     files.write_json(folder / folders.METRICS, numbers)

@@ -26,7 +26,10 @@ from calib.transforms import invert
 from calib.units import DEG
 
 Arm = str | Path | CalibratedChain
-USUAL_POSES = 12  # of a quick calibration (our choice)
+# of a quick calibration (our choice)
+USUAL_POSES = 12
+# what stands beside an arm that carries the camera, or the board
+STANDING = {"camera": "board", "board": "camera"}
 
 
 class Placed(NamedTuple):
@@ -45,13 +48,14 @@ class Placed(NamedTuple):
 
     def __str__(self) -> str:
         turn = Rotation.from_matrix(self.pose[:3, :3])
-        position, angles = 1e3 * self.pose[:3, 3], turn.as_euler("xyz") / DEG
-        position_text = ", ".join(_stated(value, 1e3 * sigma, 3) for value, sigma in zip(position, self.sigma[:3]))
+        position_mm = 1e3 * self.pose[:3, 3]
+        sigma_mm = 1e3 * self.sigma[:3]
+        position = _stated(position_mm, sigma_mm)
         if np.isnan(self.sigma[3:]).all():
-            return f"{self.name}: x y z {position_text} mm; orientation not identifiable"
-        turns = ", ".join(_stated(value, sigma / DEG, 3) for value, sigma in zip(angles, self.sigma[3:]))
+            return f"{self.name}: x y z {position} mm; orientation not identifiable"
+        angles = _stated(turn.as_euler("xyz") / DEG, self.sigma[3:] / DEG)
         quaternion = ", ".join(f"{value:.6f}" for value in turn.as_quat(canonical=True))
-        return f"{self.name}: x y z {position_text} mm; roll pitch yaw {turns} deg; quaternion x y z w {quaternion}"
+        return f"{self.name}: x y z {position} mm; roll pitch yaw {angles} deg; quaternion x y z w {quaternion}"
 
 
 class Placements(GeometryFit):
@@ -62,28 +66,36 @@ class Placements(GeometryFit):
     @property
     def placed(self) -> tuple[Placed, ...]:
         """The placed frames: targets in the tip, the arm's base in each instrument, and each instrument in the base."""
-        fit, chain = self.selection.fit, self.robot.chain
-        cell, carried = fit.cell, self.inputs.fit[0].carried[0]
-        standing = {"camera": "board", "board": "camera"}.get(carried, "instrument")
+        fit = self.selection.fit
+        chain = self.robot.chain
+        cell = fit.cell
+        block = self.inputs.fit[0]
+        carried = block.carried[0]
+        standing = STANDING.get(carried, "instrument")
         frames = list[Placed]()
         for name, pose in zip(cell.tool_names, cell.tools):
-            turned = np.kron(np.eye(2), pose[:3, :3])  # the fit's small motions are along the frame's own axes
-            frames.append(Placed(f"{carried} '{name}' in {chain.tip}", pose, _sigma(fit.estimate, name, turned)))
-        for name, pose in zip(cell.station_names, cell.stations) if self.inputs.fit[0].has_instrument else ():
-            turned, back = np.kron(np.eye(2), pose[:3, :3]), invert(pose)
-            frames.append(Placed(f"base in {standing} '{name}'", pose, _sigma(fit.estimate, name, turned)))
-            inverse_jacobian = -np.eye(6)  # of the inverse: -dp - dr × t, and -dr
-            inverse_jacobian[:3, 3:] = np.cross(back[:3, 3], np.eye(3)).T
-            frames.append(
-                Placed(f"{standing} '{name}' in {chain.base}", back, _sigma(fit.estimate, name, inverse_jacobian))
-            )
+            sigma = _sigma(fit.estimate, name, _turned(pose))
+            frames.append(Placed(f"{carried} '{name}' in {chain.tip}", pose, sigma))
+        if not block.has_instrument:
+            return tuple(frames)
+        for name, pose in zip(cell.station_names, cell.stations):
+            sigma = _sigma(fit.estimate, name, _turned(pose))
+            frames.append(Placed(f"base in {standing} '{name}'", pose, sigma))
+            # small motions of the inverse: -dp - dr × t, and -dr
+            inverse = invert(pose)
+            jacobian = -np.eye(6)
+            jacobian[:3, 3:] = np.cross(inverse[:3, 3], np.eye(3)).T
+            sigma = _sigma(fit.estimate, name, jacobian)
+            frames.append(Placed(f"{standing} '{name}' in {chain.base}", inverse, sigma))
         return tuple(frames)
 
     def lines(self, *first: str) -> Iterator[object]:
         """Yield what a command prints: the frames whose names begin with one of `first`, and the verdict."""
         poses = self.fit.poses
         yield str(self.verdict)
-        yield from (str(frame) for frame in self.placed if frame.name.startswith(first))
+        for frame in self.placed:
+            if frame.name.startswith(first):
+                yield str(frame)
         rms_mm = 1e3 * self.fit.errors[1].rms
         yield f"{poses} poses, {rms_mm:.3g} mm rms residual; σ follows from it, the arm's random errors included"
         yield from self.warnings
@@ -94,20 +106,39 @@ class Placements(GeometryFit):
         return "\n".join(self.lines(""))
 
 
+def _turned(pose: np.ndarray) -> np.ndarray:
+    """Return the Jacobian (6, 6) of the fit's small motions, which are along a frame's own axes."""
+    return np.kron(np.eye(2), pose[:3, :3])
+
+
 def _sigma(estimate: Estimate, name: str, jacobian: np.ndarray) -> np.ndarray:
     """Return the standard deviations (6,) of J times the six small motions of a frame; NaN where not identified."""
-    names = [f"{name}.{axis}" for axis in FRAME_AXES]
-    identified = [parameter in estimate.names for parameter in names]
-    index = [estimate.names.index(parameter) for parameter in names if parameter in estimate.names]
+    identified = np.zeros(6, dtype=bool)
+    index = []
+    for k, axis in enumerate(FRAME_AXES):
+        parameter = f"{name}.{axis}"
+        if parameter in estimate.names:
+            identified[k] = True
+            index.append(estimate.names.index(parameter))
     covariance = np.full((6, 6), np.nan)
     covariance[np.ix_(identified, identified)] = estimate.covariance[np.ix_(index, index)]
-    nonzero = jacobian != 0.0
-    size = [row[use] @ covariance[np.ix_(use, use)] @ row[use] for row, use in zip(jacobian, nonzero)]
-    return np.sqrt(np.array(size))
+    variances = []
+    for row in jacobian:
+        # 0 times an unidentified variance would be unidentified, too
+        nonzero = row != 0.0
+        variances.append(row[nonzero] @ covariance[np.ix_(nonzero, nonzero)] @ row[nonzero])
+    return np.sqrt(np.array(variances))
 
 
-def _stated(value: float, sigma: float, digits: int) -> str:
-    return f"{value:.{digits}f} " + ("(not identifiable)" if np.isnan(sigma) else f"± {sigma:.2g}")
+def _stated(values: np.ndarray, sigmas: np.ndarray) -> str:
+    """Return values with three decimals and their standard deviations, in the same unit."""
+    texts = []
+    for value, sigma in zip(values, sigmas):
+        if np.isnan(sigma):
+            texts.append(f"{value:.3f} (not identifiable)")
+        else:
+            texts.append(f"{value:.3f} ± {sigma:.2g}")
+    return ", ".join(texts)
 
 
 def tool(

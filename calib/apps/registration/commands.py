@@ -1,7 +1,7 @@
 """Quick commands of one frame each: tool, base, hand-eye."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -18,73 +18,56 @@ Folder = Annotated[Path | None, typer.Option("--out", help="folder for the whole
 Options = Annotated[Path | None, typer.Option("--options", help="TOML, see calib formats options")]
 
 
-@command(app, "Geometry")
-def tool(
-    robot: Robot,
-    measured: Measured,
-    settings: PlacementSettings,
-    out: Folder = None,
-    options: Options = None,
-    base: str | None = None,
-    tip: str | None = None,
-) -> None:
+def _add(name: str, frames: tuple[str, ...], help_text: str) -> None:
+    """Add a command that calibrates the placements, and prints the frames whose names begin with one of `frames`."""
+
+    def place(
+        robot: Robot,
+        measured: Measured,
+        settings: PlacementSettings,
+        out: Folder = None,
+        options: Options = None,
+        base: str | None = None,
+        tip: str | None = None,
+    ) -> None:
+        from calib.apps.registration import api
+
+        if out is not None:
+            check_destination("fit", robot, out, [options, *measured])
+        with progress() as show:
+            fit = api.tool(robot, measured, settings, options=options, base=base, tip=tip, progress=show)
+            if out is not None:
+                fit.save(out)
+        say(*fit.lines(*frames))
+        if out is not None:
+            say(f"written to {out}")
+        exit_failed(fit.verdict.level)
+
+    place.__doc__ = help_text
+    command(app, "Geometry", name)(place)
+
+
+_add(
+    "tool",
+    ("tool",),
     """Calibrate the tool (TCP) of ROBOT from a dozen measured poses, the arm left as it is.
 
     Example: calib tool robot.urdf m.csv --tolerance 0.5
-    """
-    _place("tool", ("tool",), robot, measured, settings, out, options=options, base=base, tip=tip)
-
-
-@command(app, "Geometry")
-def base(
-    robot: Robot,
-    measured: Measured,
-    settings: PlacementSettings,
-    out: Folder = None,
-    options: Options = None,
-    base: str | None = None,
-    tip: str | None = None,
-) -> None:
+    """,
+)
+_add(
+    "base",
+    ("base", "instrument"),
     """Calibrate where ROBOT stands, its base in the instrument's frame, from a dozen measured poses.
 
     Example: calib base robot.urdf measured.csv
-    """
-    _place("base", ("base", "instrument"), robot, measured, settings, out, options=options, base=base, tip=tip)
-
-
-@command(app, "Geometry", "hand-eye")
-def hand_eye(
-    robot: Robot,
-    measured: Measured,
-    settings: PlacementSettings,
-    out: Folder = None,
-    options: Options = None,
-    base: str | None = None,
-    tip: str | None = None,
-) -> None:
+    """,
+)
+_add(
+    "hand-eye",
+    ("camera", "board"),
     """Calibrate camera and board, one on ROBOT and the other beside it, from a dozen images.
 
     Example: calib hand-eye robot.urdf photos --holdout 0.25
-    """
-    _place("hand_eye", ("camera", "board"), robot, measured, settings, out, options=options, base=base, tip=tip)
-
-
-def _place(
-    verb: str,
-    frame_names: tuple[str, ...],
-    robot: str,
-    measured: list[Path],
-    settings: PlacementSettings,
-    out: Path | None,
-    **options: Any,
-) -> None:
-    from calib.apps.registration import api
-
-    if out is not None:
-        check_destination("fit", robot, out, [options["options"], *measured])
-    with progress() as show:
-        fit = getattr(api, verb)(robot, measured, settings, progress=show, **options)
-        if out is not None:
-            fit.save(out)
-    say(*fit.lines(*frame_names), *([f"written to {out}"] if out else []))
-    exit_failed(fit.verdict.level)
+    """,
+)

@@ -18,8 +18,7 @@ from scipy.interpolate import CubicSpline
 from calib.apps.studies.conditions import LIBRARY, Condition
 from calib.toolkit.chains import Chain, load, random_joints
 from calib.toolkit.installations import fit_installation, install
-from calib.toolkit.planned_motions import read_trajectory
-from calib.toolkit.recordings import USABLE, FilterOptions, Recording, design_decimator, make_motion
+from calib.toolkit.recordings import USABLE, FilterOptions, Recording, design_decimator, make_motion, read_trajectory
 from calib.toolkit.simulations import (
     LoopController,
     LoopSettings,

@@ -37,13 +37,15 @@ def view(
         raise UsageError("nothing to do: give --save FILE.rrd, or omit --no-spawn")
     scene = None
     if save:
-        entries = folder.iterdir() if folder.is_dir() else ()
-        read = [folder, robot, *(path for path in entries if path.suffix != ".rrd")]
-        with results([(save, (".rrd",))], read, overwrite):
+        inputs = [folder, robot]
+        if folder.is_dir():
+            inputs += [path for path in folder.iterdir() if path.suffix != ".rrd"]
+        with results([(save, (".rrd",))], inputs, overwrite):
             scene = viewer.write(folder, save, robot)
         size = f"{1e-6 * save.stat().st_size:.1f} MB"
         say(f"{save}: {size}; {command_line(save, program='rerun')} shows it")
     if spawn or (spawn is None and save is None):
         scene = viewer.spawn(folder, robot)
-    for note in scene.notes if scene else ():
-        say(f"note: {note}")
+    if scene is not None:
+        for note in scene.notes:
+            say(f"note: {note}")

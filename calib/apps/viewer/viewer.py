@@ -17,17 +17,24 @@ import numpy as np
 
 from calib import files
 from calib.errors import CalibError, UsageError, command_line, refused_as
-from calib.toolkit.chains import Chain, joint_frames
-from calib.toolkit.opened_results import DrawnRobot as Drawn
-from calib.toolkit.opened_results import ErrorSizes, Measured, Played, Scene, Torques, drawn, strips, thinned
+from calib.toolkit.chains import Chain, Joint, joint_frames
+from calib.toolkit.result_folders import DrawnRobot as Drawn
+from calib.toolkit.result_folders import ErrorSizes, Measured, Played, Scene, Torques, drawn, strips, thinned
 from calib.transforms import to_quaternion
 
 if TYPE_CHECKING:
     from rerun import RecordingStream, TimeColumn
 
-ARM, BEFORE, AFTER, SEEN, LIMIT = ([90, 100, 115], [213, 94, 0], [0, 130, 90], [40, 90, 180], [200, 60, 60])
-GAP = 1.0  # between one part and the next [s]
-EACH = 0.2  # that a pose stands still [s]
+# colours, red, green and blue
+ARM = [90, 100, 115]
+BEFORE = [213, 94, 0]
+AFTER = [0, 130, 90]
+SEEN = [40, 90, 180]
+LIMIT = [200, 60, 60]
+# between one part and the next [s]
+GAP = 1.0
+# that a pose stands still [s]
+EACH = 0.2
 FILE = "session.rrd"
 
 
@@ -86,9 +93,8 @@ def spawn(folder: str | Path, robot: str | None = None) -> Scene:
         raise UsageError(f"no display to open a window on; {saved} writes a file for rerun on another computer")
     scene = drawn(folder, robot)
     recording = rr.RecordingStream(files.MAKER, recording_id=scene.title)
-    with refused_as(
-        CalibError, Exception, "Rerun's window did not open ({}); calib view --save FILE.rrd writes a file"
-    ):
+    message = "Rerun's window did not open ({}); calib view --save FILE.rrd writes a file"
+    with refused_as(CalibError, Exception, message):
         recording.spawn(default_blueprint=_blueprint(scene))
     _send(recording, scene)
     recording.flush()
@@ -151,17 +157,25 @@ def _size_lines(sizes: ErrorSizes) -> Iterator[str]:
     for label, rows in (("fitted", ~sizes.unseen), ("unseen", sizes.unseen)):
         if not rows.any():
             continue
-        errors = [1e3 * size[rows & np.isfinite(size)] for size in (sizes.nominal, sizes.calibrated)]
-        rms = [f"{float(np.sqrt(np.mean(size**2))):.3f} mm" if len(size) else "not stated" for size in errors]
-        yield (
-            f"{int(rows.sum())} {label} rows without a position in the arm's base: {sizes.kind} errors, "
-            f"{rms[0]} rms nominal (orange), {rms[1]} calibrated (green)"
-        )
+        beginning = f"{int(rows.sum())} {label} rows without a position in the arm's base: {sizes.kind} errors"
+        nominal = _rms_mm(sizes.nominal[rows])
+        calibrated = _rms_mm(sizes.calibrated[rows])
+        yield f"{beginning}, {nominal} rms nominal (orange), {calibrated} calibrated (green)"
+
+
+def _rms_mm(sizes: np.ndarray) -> str:
+    """Return the rms of sizes of errors (m,) [m] as text; NaN are those of rows without one."""
+    errors_mm = 1e3 * sizes[np.isfinite(sizes)]
+    if not len(errors_mm):
+        return "not stated"
+    return f"{_rms(errors_mm):.3f} mm"
 
 
 def _poses(name: str, count: int, start: float, selection: np.ndarray | None = None) -> list[TimeColumn]:
-    """Return the time columns of `count` poses, or `some` of them: the common clock from `start` [s], and a counter."""
-    steps = np.arange(1, count + 1) if selection is None else selection + 1
+    """Return the time columns of `count` poses, or those selected: the common clock from `start` [s], and a counter."""
+    steps = np.arange(1, count + 1)
+    if selection is not None:
+        steps = selection + 1
     return [rr.TimeColumn("time", duration=start + EACH * steps), rr.TimeColumn(name, sequence=steps)]
 
 
@@ -169,52 +183,59 @@ def _measured(recording: RecordingStream, scene: Scene, measured: Measured, star
     """Log points and error arrows, together and pose by pose; return the start time of the next part [s]."""
     if not len(measured.q) or scene.chain is None:
         return start
+    count = len(measured.q)
     scale = measured.arrow_scale(scene.chain)
-    index = _poses("pose", len(measured.q), start)
+    index = _poses("pose", count, start)
     recording.log("world/seen", rr.Points3D(measured.seen, radii=0.006, colors=SEEN), static=True)
     for name, points, colour in (("nominal", measured.nominal, BEFORE), ("calibrated", measured.calibrated, AFTER)):
-        errors = scale * (measured.seen - points)
-        entity = f"world/errors_times_{scale:g}/{name}"
-        recording.log(entity, rr.Arrows3D(vectors=errors, origins=points, colors=colour, radii=0.004), static=True)
+        errors = measured.seen - points
+        arrows = rr.Arrows3D(vectors=scale * errors, origins=points, colors=colour, radii=0.004)
+        recording.log(f"world/errors_times_{scale:g}/{name}", arrows, static=True)
         recording.log(f"world/tool/{name}", rr.Points3D(points, radii=0.006, colors=colour), static=True)
-        size = 1e3 * np.linalg.norm(measured.seen - points, axis=1)
-        _series(recording, f"errors/{name}", index, size, f"{name} [mm]", colour)
+        size_mm = 1e3 * np.linalg.norm(errors, axis=1)
+        _series(recording, f"errors/{name}", index, size_mm, f"{name} [mm]", colour)
     residual_mm = 1e3 * (measured.seen - measured.calibrated)
     for k, axis in enumerate("xyz"):
         _series(recording, f"axes/position/{axis}", index, residual_mm[:, k], f"{axis} in the arm's base [mm]")
-    measured_rows = np.flatnonzero(np.isfinite(measured.turned).all(axis=1))
-    if len(measured_rows):
-        index_measured = _poses("pose", len(measured.q), start, measured_rows)
-        turned = 1e3 * measured.turned[measured_rows]
-        size = np.linalg.norm(turned, axis=1)
-        _series(recording, "turns/calibrated", index_measured, size, "orientation, calibrated [mrad]", AFTER)
+
+    rows = np.flatnonzero(np.isfinite(measured.turned).all(axis=1))
+    if len(rows):
+        index_of_rows = _poses("pose", count, start, rows)
+        turns_mrad = 1e3 * measured.turned[rows]
+        size_mrad = np.linalg.norm(turns_mrad, axis=1)
+        _series(recording, "turns/calibrated", index_of_rows, size_mrad, "orientation, calibrated [mrad]", AFTER)
         for k, axis in enumerate("xyz"):
-            _series(recording, f"axes/orientation/{axis}", index_measured, turned[:, k], f"about {axis} [mrad]")
+            entity = f"axes/orientation/{axis}"
+            _series(recording, entity, index_of_rows, turns_mrad[:, k], f"about {axis} [mrad]")
     if measured.unseen.any():
         is_unseen = np.where(measured.unseen, 1.0, 0.0)
         _series(recording, "errors/unseen", index, is_unseen, "1: unseen, 0: fitted", SEEN)
-    pose_columns = rr.Points3D.columns(
-        positions=measured.seen, radii=np.full(len(measured.q), 0.015), colors=np.tile(SEEN, (len(measured.q), 1))
-    )
+
+    radii = np.full(count, 0.015)
+    colours = np.tile(SEEN, (count, 1))
+    pose_columns = rr.Points3D.columns(positions=measured.seen, radii=radii, colors=colours)
     recording.send_columns("world/pose", indexes=index, columns=pose_columns)
     _arm(recording, scene, index, measured.q)
-    return start + EACH * len(measured.q) + GAP
+    return start + EACH * count + GAP
 
 
 def _sizes(recording: RecordingStream, scene: Scene, sizes: ErrorSizes, start: float) -> float:
     """Log the sizes of errors row by row, with the arm at each; return the start time of the next part [s]."""
-    entity = "errors" if sizes.kind == "position" else f"errors/{sizes.kind}"
+    count = len(sizes.q)
+    entity = f"errors/{sizes.kind}"
+    if sizes.kind == "position":
+        entity = "errors"
     for name, size, colour in (("nominal", sizes.nominal, BEFORE), ("calibrated", sizes.calibrated, AFTER)):
-        finite_rows = np.flatnonzero(np.isfinite(size))
-        if len(finite_rows):
-            index = _poses("row", len(sizes.q), start, finite_rows)
-            _series(recording, f"{entity}/{name}", index, 1e3 * size[finite_rows], f"{name} [mm]", colour)
-    index = _poses("row", len(sizes.q), start)
+        rows = np.flatnonzero(np.isfinite(size))
+        if len(rows):
+            index = _poses("row", count, start, rows)
+            _series(recording, f"{entity}/{name}", index, 1e3 * size[rows], f"{name} [mm]", colour)
+    index = _poses("row", count, start)
     if sizes.unseen.any():
         is_unseen = np.where(sizes.unseen, 1.0, 0.0)
         _series(recording, f"{entity}/unseen", index, is_unseen, "1: unseen, 0: fitted", SEEN)
     _arm(recording, scene, index, sizes.q)
-    return start + EACH * len(sizes.q) + GAP
+    return start + EACH * count + GAP
 
 
 def _chosen(
@@ -223,11 +244,12 @@ def _chosen(
     """Log a pose plan as it grows: one more tool position each step, and the arm at the newest pose."""
     tips = strips(chain, q)[0][:, -1]
     counts = np.arange(1, len(q) + 1)
-    grown = np.concatenate([tips[:k] for k in counts])
-    columns = rr.Points3D.columns(positions=grown, radii=np.full(len(grown), 0.008)).partition(counts)
+    positions = np.concatenate([tips[:k] for k in counts])
+    points = rr.Points3D.columns(positions=positions, radii=np.full(len(positions), 0.008))
     index = _poses(f"chosen: {name}", len(q), start)
-    recording.send_columns(f"world/chosen/{_part(name)}", indexes=index, columns=columns)
-    _series(recording, f"chosen/{_part(name)}", index, counts.astype(float), f"{name}: poses", SEEN)
+    part = _part(name)
+    recording.send_columns(f"world/chosen/{part}", indexes=index, columns=points.partition(counts))
+    _series(recording, f"chosen/{part}", index, counts.astype(float), f"{name}: poses", SEEN)
     _arm(recording, scene, index, q)
     return start + EACH * len(q) + GAP
 
@@ -237,24 +259,29 @@ def _played(recording: RecordingStream, scene: Scene, played: Played, start: flo
     t = start + played.t - played.t[0]
     samples = thinned(played.t)
     index = [rr.TimeColumn("time", duration=t[samples])]
-    names = scene.chain.joint_names if scene.chain is not None else [f"q{k + 1}" for k in range(played.q.shape[1])]
-    ends = [rr.TimeColumn("time", duration=t[[0, -1]])]
+    names = [f"q{k + 1}" for k in range(played.q.shape[1])]
+    if scene.chain is not None:
+        names = list(scene.chain.joint_names)
     for j, name in enumerate(names):
         _series(recording, f"motion/position/{_part(name)}", index, played.q[samples, j], name)
         if played.v is not None:
             _series(recording, f"motion/velocity/{_part(name)}", index, played.v[samples, j], name)
-        if scene.chain is None:
-            continue
-        joint = scene.chain.joints[j]
-        for side, value in (("lower", joint.lower), ("upper", joint.upper)):
-            if np.isfinite(value):
-                _series(recording, f"limits/position/{_part(name)}/{side}", ends, [value] * 2, f"{name} {side}", LIMIT)
-        if np.isfinite(joint.velocity) and played.v is not None:
-            for sign, side in ((-1.0, "lower"), (1.0, "upper")):
-                value = sign * joint.velocity
-                _series(recording, f"limits/velocity/{_part(name)}/{side}", ends, [value] * 2, f"{name} {side}", LIMIT)
+        if scene.chain is not None:
+            _limits(recording, scene.chain.joints[j], name, t[[0, -1]], played.v is not None)
     _arm(recording, scene, index, played.q[samples])
     return float(t[-1]) + GAP
+
+
+def _limits(recording: RecordingStream, joint: Joint, name: str, ends: np.ndarray, velocities: bool) -> None:
+    """Log a joint's limits, where it has any, as lines over a motion's first and last time (2,) [s]."""
+    index = [rr.TimeColumn("time", duration=ends)]
+    limits = [("position", "lower", joint.lower), ("position", "upper", joint.upper)]
+    if velocities:
+        limits += [("velocity", "lower", -joint.velocity), ("velocity", "upper", joint.velocity)]
+    for kind, side, value in limits:
+        if np.isfinite(value):
+            entity = f"limits/{kind}/{_part(name)}/{side}"
+            _series(recording, entity, index, [value, value], f"{name} {side}", LIMIT)
 
 
 def _torques(recording: RecordingStream, scene: Scene, torques: Torques, start: float) -> float:
@@ -262,10 +289,12 @@ def _torques(recording: RecordingStream, scene: Scene, torques: Torques, start: 
     t = start + torques.t - torques.t[0]
     index = [rr.TimeColumn("time", duration=t)]
     for j, (name, unit) in enumerate(zip(torques.rows, torques.units)):
-        measured, predicted = torques.measured[:, j], torques.predicted[:, j]
-        _series(recording, f"torques/{_part(name)}/measured", index, measured, f"measured [{unit}]", BEFORE)
-        _series(recording, f"torques/{_part(name)}/predicted", index, predicted, f"predicted [{unit}]", AFTER)
-        _series(recording, f"residuals/{_part(name)}", index, measured - predicted, f"{name} [{unit}]")
+        part = _part(name)
+        measured = torques.measured[:, j]
+        predicted = torques.predicted[:, j]
+        _series(recording, f"torques/{part}/measured", index, measured, f"measured [{unit}]", BEFORE)
+        _series(recording, f"torques/{part}/predicted", index, predicted, f"predicted [{unit}]", AFTER)
+        _series(recording, f"residuals/{part}", index, measured - predicted, f"{name} [{unit}]")
     if torques.q is not None:
         samples = thinned(torques.t)
         _arm(recording, scene, [rr.TimeColumn("time", duration=t[samples])], torques.q[samples])
@@ -286,8 +315,12 @@ def _series(
     colour: Sequence[int] | None = None,
 ) -> None:
     """Log one line of a plot with its legend."""
-    recording.log(path, rr.SeriesLines(names=name, **({} if colour is None else {"colors": colour})), static=True)
-    recording.send_columns(path, indexes=index, columns=rr.Scalars.columns(scalars=np.asarray(values, dtype=float)))
+    style = {}
+    if colour is not None:
+        style["colors"] = colour
+    recording.log(path, rr.SeriesLines(names=name, **style), static=True)
+    scalars = rr.Scalars.columns(scalars=np.asarray(values, dtype=float))
+    recording.send_columns(path, indexes=index, columns=scalars)
 
 
 def _arm(recording: RecordingStream, scene: Scene, index: list[TimeColumn], q: np.ndarray) -> None:
@@ -295,37 +328,41 @@ def _arm(recording: RecordingStream, scene: Scene, index: list[TimeColumn], q: n
     if scene.chain is None or q.shape[1] != scene.chain.n:
         return
     lines = strips(scene.chain, q)
-    thick = 0.006 if scene.meshes else 0.018 / len(lines)
-    count = len(q) * len(lines)
-    line_strips = rr.LineStrips3D.columns(
-        strips=[line for at_once in zip(*lines) for line in at_once],
-        radii=np.full(count, thick),
-        colors=np.tile(ARM, (count, 1)),
-    )
-    recording.send_columns("world/robot/lines", indexes=index, columns=line_strips.partition([len(lines)] * len(q)))
+    radius = 0.018 / len(lines)
+    if scene.meshes:
+        # thin, so that the meshes hide them
+        radius = 0.006
+    lines_by_pose = []
+    for lines_of_pose in zip(*lines):
+        lines_by_pose += lines_of_pose
+    count = len(lines_by_pose)
+    colours = np.tile(ARM, (count, 1))
+    line_columns = rr.LineStrips3D.columns(strips=lines_by_pose, radii=np.full(count, radius), colors=colours)
+    line_counts = [len(lines)] * len(q)
+    recording.send_columns("world/robot/lines", indexes=index, columns=line_columns.partition(line_counts))
+
     points = np.concatenate(lines, axis=1)
-    count = points.shape[1]
-    spheres = rr.Points3D.columns(
-        positions=points.reshape(-1, 3),
-        radii=np.full(count * len(q), 1.4 * thick),
-        colors=np.tile(ARM, (count * len(q), 1)),
-    )
-    recording.send_columns("world/robot/joints", indexes=index, columns=spheres.partition([count] * len(q)))
+    points_of_pose = points.shape[1]
+    count = points_of_pose * len(q)
+    colours = np.tile(ARM, (count, 1))
+    radii = np.full(count, 1.4 * radius)
+    spheres = rr.Points3D.columns(positions=points.reshape(-1, 3), radii=radii, colors=colours)
+    point_counts = [points_of_pose] * len(q)
+    recording.send_columns("world/robot/joints", indexes=index, columns=spheres.partition(point_counts))
     if scene.meshes and isinstance(scene.chain, Chain):
-        frames = joint_frames(scene.chain, q)
-        for link, frame in zip(scene.chain.links, frames):
-            moves = rr.Transform3D.columns(translation=frame[:, :3, 3], quaternion=to_quaternion(frame))
-            recording.send_columns(f"world/robot/links/{_part(link)}", indexes=index, columns=moves)
+        for link, frame in zip(scene.chain.links, joint_frames(scene.chain, q)):
+            motion = rr.Transform3D.columns(translation=frame[:, :3, 3], quaternion=to_quaternion(frame))
+            recording.send_columns(f"world/robot/links/{_part(link)}", indexes=index, columns=motion)
 
 
 def _meshes(recording: RecordingStream, scene: Scene) -> None:
     """Log the meshes, each once, under the frame of its link."""
     for number, mesh in enumerate(scene.meshes):
         entity = f"world/robot/links/{_part(mesh.link)}/mesh_{number}"
-        placed = rr.Transform3D(
-            translation=mesh.placement[:3, 3], quaternion=to_quaternion(mesh.placement), scale=mesh.scale
-        )
-        recording.log(entity, placed, rr.Asset3D(path=mesh.file), static=True)
+        position = mesh.placement[:3, 3]
+        orientation = to_quaternion(mesh.placement)
+        placement = rr.Transform3D(translation=position, quaternion=orientation, scale=mesh.scale)
+        recording.log(entity, placement, rr.Asset3D(path=mesh.file), static=True)
 
 
 def _blueprint(scene: Scene) -> Any:
@@ -333,7 +370,8 @@ def _blueprint(scene: Scene) -> Any:
     import rerun.blueprint as rrb
 
     tabs: list[Any] = []
-    silent = rrb.PlotLegend(visible=False)  # a line's name shows where the pointer is
+    # a line's name shows where the pointer is
+    silent = rrb.PlotLegend(visible=False)
     if scene.chosen:
         tabs.append(rrb.TimeSeriesView(origin="chosen", name="pose plans"))
     if scene.measured:
@@ -357,11 +395,12 @@ def _blueprint(scene: Scene) -> Any:
             views.append(view)
         tabs.append(rrb.Vertical(*views, name="motion"))
     if scene.torques:
-        names: dict[str, None] = {}  # in order of appearance
+        names: list[str] = []
         for torques in scene.torques:
-            names.update(dict.fromkeys(torques.rows))
+            names += torques.rows
         plots = []
-        for name in names:
+        # each once, in order of appearance
+        for name in dict.fromkeys(names):
             plot = rrb.TimeSeriesView(origin=f"torques/{_part(name)}", name=name, plot_legend=silent)
             plots.append(plot)
         grid = rrb.Grid(*plots, grid_columns=2)
@@ -371,13 +410,11 @@ def _blueprint(scene: Scene) -> Any:
     right = rrb.Tabs(*tabs, active_tab=int(bool(scene.measured and scene.chosen)))
     text = rrb.TextDocumentView(origin="about", name="what is shown")
     left = rrb.Vertical(picture, text, row_shares=[4, 1])
+    views = rrb.Horizontal(left, right, column_shares=[3, 2])
     timeline = "pose"
     if scene.chosen or scene.played or scene.torques:
         timeline = "time"
-    return rrb.Blueprint(
-        rrb.Horizontal(left, right, column_shares=[3, 2]),
-        rrb.TimePanel(timeline=timeline, state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.BlueprintPanel(state="collapsed"),
-        auto_views=False,
-    )
+    time_panel = rrb.TimePanel(timeline=timeline, state="collapsed")
+    selection_panel = rrb.SelectionPanel(state="collapsed")
+    blueprint_panel = rrb.BlueprintPanel(state="collapsed")
+    return rrb.Blueprint(views, time_panel, selection_panel, blueprint_panel, auto_views=False)

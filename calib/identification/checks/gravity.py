@@ -88,7 +88,8 @@ class GravityHypotheses:
     @property
     def factor(self) -> float:
         """Ratio of the rms residuals with the other direction and with the stated one, their geometric mean."""
-        return float(np.exp(np.mean(np.log(self.after / self.before))))
+        ratio = self.after / self.before
+        return float(np.exp(np.mean(np.log(ratio))))
 
     @property
     def refuted(self) -> bool:
@@ -125,7 +126,8 @@ def gravity_of(motions: Sequence[MotionSamples], chain: Chain, newtons: bool = T
                 factors = -factors
     # Outweighed: the whole torque varies less than gravity's alone would.
     certain = np.isfinite(factors) & (np.abs(factors) + 2.0 * sigmas < MAX_FACTOR) & outweighed
-    absent = _without_gravity(sums, gravity, after, np.flatnonzero(certain).tolist())
+    candidates = np.flatnonzero(certain).tolist()
+    absent = _without_gravity(sums, gravity, after, candidates)
     return GravityHypotheses(stated, before, direction, after, ambiguous, absent, factors, sigmas)
 
 
@@ -215,14 +217,16 @@ class _GravitySums:
         def squares(gravity: np.ndarray) -> float:
             change = self._under(gravity)
             square = change.T @ total @ change
-            return float(square[-1, -1] - square[-1, :-1] @ _solved(square))
+            explained = square[-1, :-1] @ _solved(square)
+            return float(square[-1, -1] - explained)
 
         return squares
 
     def _under(self, gravity: np.ndarray) -> np.ndarray:
         """Return the matrix (k, p + 1) from the columns of bodies under a gravity vector (3,) to all columns."""
         inertial = np.eye(10 * self.bodies)
-        masses = inertial.reshape(self.bodies, 10, -1)[:, MASSES].reshape(4 * self.bodies, -1)
+        by_body = inertial.reshape(self.bodies, 10, -1)
+        masses = by_body[:, MASSES].reshape(4 * self.bodies, -1)
         heavy = [component * masses for component in gravity]
         bodies = np.vstack([inertial, *heavy])
         drives = np.eye(4 * self.n + 1)
@@ -252,13 +256,15 @@ def _columns(motion: MotionSamples) -> np.ndarray:
     m, n = motion.q.shape
     zero = np.zeros_like(motion.v)
     weightless = motion.bodies.with_gravity(np.zeros(3))
-    columns = [regressor(weightless, motion.q, motion.v, motion.a).reshape(m, n, -1)]
+    body_columns = regressor(weightless, motion.q, motion.v, motion.a)
+    columns = [body_columns.reshape(m, n, -1)]
     for axis in np.eye(3):
         at_rest = regressor(motion.bodies.with_gravity(axis), motion.q, zero, zero)
         heavy = at_rest.reshape(m, n, -1, 10)[..., MASSES]
         columns.append(heavy.reshape(m, n, -1))
     torque = motion.torque - motion.torque.mean(axis=0)
-    return np.concatenate([*columns, motion.drives, torque[:, :, None]], axis=2)
+    target = torque[:, :, None]
+    return np.concatenate([*columns, motion.drives, target], axis=2)
 
 
 def _solved(square: np.ndarray) -> np.ndarray:
@@ -267,7 +273,8 @@ def _solved(square: np.ndarray) -> np.ndarray:
     scale = np.where(size > 1e-9 * size.max(), size, np.inf)
     scaled = square[:-1, :-1] / (scale[:, None] * scale)
     scaled.flat[:: len(scaled) + 1] += 1e-9
-    return np.asarray(np.linalg.solve(scaled, square[:-1, -1] / scale) / scale)
+    solution = np.linalg.solve(scaled, square[:-1, -1] / scale)
+    return np.asarray(solution / scale)
 
 
 def _mean(ratios: np.ndarray) -> float:
@@ -310,7 +317,8 @@ def _refined(cost: Callable[[np.ndarray], float], start: np.ndarray) -> np.ndarr
         return np.asarray(size * vector / np.linalg.norm(vector))
 
     def turned_cost(amounts: np.ndarray) -> float:
-        return cost(turned(amounts))
+        problem = turned(amounts)
+        return cost(problem)
 
     corners = [[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]]
     options = {"initial_simplex": corners, "xatol": 1e-4, "fatol": 1e-4 * cost(start), "maxfev": 80}
@@ -343,7 +351,8 @@ def _gravity_factors(
     if has_masses:
         reference = standard_parameters(chain)
     else:
-        reference = np.asarray(rods(chain, IdentificationModel(motions[0].bodies, ()))).ravel()
+        bodies_alone = IdentificationModel(motions[0].bodies, ())
+        reference = np.asarray(rods(chain, bodies_alone)).ravel()
     scale = 1.0
     if not (has_masses and newtons):
         scale = _inertia_factor(motions, reference)
@@ -364,7 +373,8 @@ def _gravity_factors(
     size = expected.std(axis=0)
     min_size = MIN_SHARE * max(float(size.max()), 1e-9)
     for joint in np.flatnonzero(size > min_size):
-        free = basis(np.column_stack([inertia[:, joint], drives[:, joint]]))
+        columns = np.column_stack([inertia[:, joint], drives[:, joint]])
+        free = basis(columns)
         expected_part = expected[:, joint] - free @ (free.T @ expected[:, joint])
         torque_part = torque[:, joint] - free @ (free.T @ torque[:, joint])
         if np.sqrt(np.mean(expected_part**2)) < MIN_CORRELATED * size[joint]:
@@ -388,5 +398,8 @@ def _inertia_factor(motions: Sequence[MotionSamples], reference: np.ndarray) -> 
         moving.append(columns[:, :, : len(reference)] @ reference)
         free.append(columns[:, :, len(reference) : -1])
         torque.append(columns[:, :, -1])
-    factor, sigma = common_factor(np.concatenate(torque), np.concatenate(moving), np.concatenate(free))
+    torques = np.concatenate(torque)
+    moving_torques = np.concatenate(moving)
+    free_torques = np.concatenate(free)
+    factor, sigma = common_factor(torques, moving_torques, free_torques)
     return factor if factor > MIN_SIGMAS * sigma else np.nan

@@ -96,14 +96,19 @@ def locate(recording: Recording, motion: DesignedMotion) -> LocatedMotion | None
     designed = np.tile(reference, (recalled.periods, 1))[: len(recorded)]
     tracking = np.sqrt(np.mean((recorded - designed) ** 2, axis=0))
     relative = tracking / np.maximum(np.std(reference, axis=0), 1e-9)
+    began = start + STEP * recalled.lag
+    likeness = min(recalled.likeness)
+    loosest = int(np.argmax(relative))
+    padded_start = start - EDGE_TIME
+    padded_stop = stop + EDGE_TIME
     return LocatedMotion(
-        start=max(float(recording.t[0]), start - EDGE_TIME),
-        stop=min(float(recording.t[-1]), stop + EDGE_TIME),
-        began=start + STEP * recalled.lag,
+        start=max(float(recording.t[0]), padded_start),
+        stop=min(float(recording.t[-1]), padded_stop),
+        began=began,
         periods=recalled.periods,
         tracking=tuple(tracking.tolist()),
-        likeness=min(recalled.likeness),
-        loosest=int(np.argmax(relative)),
+        likeness=likeness,
+        loosest=loosest,
     )
 
 
@@ -157,7 +162,8 @@ def _coarse(t: np.ndarray) -> np.ndarray:
     before_gap = np.flatnonzero(np.diff(t) > MAX_GAP)
     starts = t[np.append(0, before_gap + 1)]
     stops = np.append(t[before_gap] + MAX_GAP, t[-1])
-    return np.concatenate([np.arange(start, stop, STEP) for start, stop in zip(starts, stops)])
+    pieces = [np.arange(start, stop, STEP) for start, stop in zip(starts, stops)]
+    return np.concatenate(pieces)
 
 
 def _sampled(t: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
@@ -280,7 +286,8 @@ def _smooth(values: np.ndarray, order: int = 0) -> np.ndarray:
     from scipy.signal import savgol_filter
 
     size = 2 * min(HALF_WIDTH, (len(values) - 1) // 2) + 1
-    return np.asarray(savgol_filter(values, size, min(3, size - 1), order, STEP, axis=0))
+    degree = min(3, size - 1)
+    return np.asarray(savgol_filter(values, size, degree, order, STEP, axis=0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -310,13 +317,15 @@ class MotionSamples:
     @cached_property
     def inertial(self) -> np.ndarray:
         """Regressor of the bodies (N, n, 10 B)."""
-        return regressor(self.bodies, self.q, self.v, self.a).reshape(*self.q.shape, -1)
+        columns = regressor(self.bodies, self.q, self.v, self.a)
+        return columns.reshape(*self.q.shape, -1)
 
     @cached_property
     def at_rest(self) -> np.ndarray:
         """Regressor of the bodies at rest (N, n, 10 B): gravity alone."""
         zero = np.zeros_like(self.v)
-        return regressor(self.bodies, self.q, zero, zero).reshape(*self.q.shape, -1)
+        columns = regressor(self.bodies, self.q, zero, zero)
+        return columns.reshape(*self.q.shape, -1)
 
     @cached_property
     def drives(self) -> np.ndarray:
@@ -335,7 +344,8 @@ def take_samples(case: Case, bodies: Bodies, count: int) -> MotionSamples | None
 
     motion = case.motion
     edge = int(SEGMENT_EDGE * motion.rate)
-    inner = np.concatenate([np.arange(start + edge, stop - edge) for start, stop in segments(motion.segment)])
+    pieces = [np.arange(start + edge, stop - edge) for start, stop in segments(motion.segment)]
+    inner = np.concatenate(pieces)
     if len(inner) < 20 * motion.n or case.target.shape[1] != motion.n:
         return None
     index = inner[:: max(1, len(inner) // count)]
@@ -349,7 +359,8 @@ def take_samples(case: Case, bodies: Bodies, count: int) -> MotionSamples | None
 
 def drive_columns(v: np.ndarray, a: np.ndarray) -> np.ndarray:
     """Return the drive columns (..., 4) of velocities and accelerations (...): a, v, smoothed sign(v), and 1."""
-    return np.stack([a, v, np.tanh(v / CREEP), np.ones_like(v)], axis=-1)
+    sign = np.tanh(v / CREEP)
+    return np.stack([a, v, sign, np.ones_like(v)], axis=-1)
 
 
 def basis(columns: np.ndarray) -> np.ndarray:
@@ -362,8 +373,11 @@ def spanning(square: np.ndarray) -> np.ndarray:
     size = np.sqrt(np.diag(square))
     nonzero = np.flatnonzero(size > 1e-9 * size.max())
     nonzero_size = size[nonzero]
-    values, vectors = np.linalg.eigh(square[np.ix_(nonzero, nonzero)] / (nonzero_size[:, None] * nonzero_size))
+    block = square[np.ix_(nonzero, nonzero)]
+    scale = nonzero_size[:, None] * nonzero_size
+    values, vectors = np.linalg.eigh(block / scale)
     independent = values > 1e-9 * values[-1]
     result = np.zeros((len(size), int(independent.sum())))
-    result[nonzero] = vectors[:, independent] / np.sqrt(values[independent]) / nonzero_size[:, None]
+    unit_directions = vectors[:, independent] / np.sqrt(values[independent])
+    result[nonzero] = unit_directions / nonzero_size[:, None]
     return result

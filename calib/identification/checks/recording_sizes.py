@@ -94,7 +94,9 @@ def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
     """
     if chain.n < MIN_JOINTS:
         return None
-    robots = [np.asarray(rods(chain, IdentificationModel(bodies_of(chain), ()))).ravel()]
+    bodies = bodies_of(chain)
+    bodies_alone = IdentificationModel(bodies, ())
+    robots = [np.asarray(rods(chain, bodies_alone)).ravel()]
     if chain.inertias is not None and chain.inertias[:, 9].any():
         robots.append(standard_parameters(chain))
     ratios = []
@@ -115,7 +117,8 @@ def _ratio_to(robot: np.ndarray, samples: MotionSamples) -> ClockRatio | None:
     mass, mass_sigma = common_factor(samples.torque, of_gravity @ robot, beside_gravity)
     if inertia < MIN_FACTOR_SIGMAS * inertia_sigma or mass < MIN_FACTOR_SIGMAS * mass_sigma:
         return None
-    return ClockRatio(inertia / mass, float(np.hypot(inertia_sigma / inertia, mass_sigma / mass)))
+    relative_sigma = float(np.hypot(inertia_sigma / inertia, mass_sigma / mass))
+    return ClockRatio(inertia / mass, relative_sigma)
 
 
 def common_factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray) -> tuple[float, float]:
@@ -127,7 +130,9 @@ def common_factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray) -> t
     alpha = power = 0.0
     for _ in range(ROUNDS):
         scale = np.repeat(weight, m)
-        free_basis = basis(free.transpose(1, 0, 2).reshape(m * n, -1) * scale[:, None])
+        flat = free.transpose(1, 0, 2).reshape(m * n, -1)
+        columns = flat * scale[:, None]
+        free_basis = basis(columns)
         torque_part = _without(free_basis, torque.T.ravel() * scale)
         common_part = _without(free_basis, common.T.ravel() * scale)
         power = float(common_part @ common_part)
@@ -186,7 +191,8 @@ def _unexplained_function(samples: MotionSamples) -> Callable[[np.ndarray], np.n
     scale = 1.0 / np.maximum(samples.torque.std(axis=0), 1e-12)
 
     def weighted_rows(columns: np.ndarray) -> np.ndarray:
-        return (columns * scale[:, None]).transpose(1, 0, 2).reshape(n * m, -1)
+        scaled = (columns * scale[:, None]).transpose(1, 0, 2)
+        return scaled.reshape(n * m, -1)
 
     # Bodies and offsets are free, the drives' other parameters not negative.
     drives = samples.drives.reshape(m, n, n, 4)
@@ -263,8 +269,10 @@ def _unexplained_by_masses(samples: MotionSamples, masses: np.ndarray) -> np.nda
     centred = samples.torque - samples.torque.mean(axis=0)
     shares = []
     for joint, torque in enumerate(centred.T):
-        neighbours = drives[:, max(joint - 1, 0) : joint + 2].reshape(len(torque), -1)
-        orthonormal = basis(np.column_stack([of_gravity[:, joint], of_motion[:, joint], neighbours]))
+        near = drives[:, max(joint - 1, 0) : joint + 2]
+        neighbours = near.reshape(len(torque), -1)
+        joint_columns = np.column_stack([of_gravity[:, joint], of_motion[:, joint], neighbours])
+        orthonormal = basis(joint_columns)
         explained = ((torque @ orthonormal) ** 2).sum()
         shares.append(1.0 - explained / max(float(torque @ torque), 1e-300))
     return np.maximum(shares, 1e-9)
@@ -318,7 +326,9 @@ def compare_sizes(
     motion = case.motion
     unknown = np.full(chain.n, np.nan)
     of_motors = newtons and case.target.shape[1] == chain.n
-    has_masses = chain.inertias is not None and bool(np.any(chain.inertias[:, 9] > 0.0))
+    has_masses = False
+    if chain.inertias is not None:
+        has_masses = bool(np.any(chain.inertias[:, 9] > 0.0))
 
     masses, limits = unknown, unknown
     if of_motors and has_masses:
@@ -342,6 +352,7 @@ def compare_sizes(
         clock = clock_ratio(samples, chain)
     if of_motors and has_masses and samples is not None:
         other = rearranged(samples, chain)
+    counted = motion.sampling.clock.kind == "counted"
     return RecordingSizes(
         name=case.name,
         masses=masses,
@@ -349,7 +360,7 @@ def compare_sizes(
         speed=speed,
         speed_sigma=speed_sigma,
         follows=follows,
-        counted=motion.sampling.clock.kind == "counted",
+        counted=counted,
         rate=motion.rate,
         lag=lag,
         clock=clock,
@@ -360,7 +371,8 @@ def compare_sizes(
 
 def signs_of(case: Case, chain: Chain, gravity: Sequence[float] | None = None) -> Explanation | None:
     """Return the joints of a recording with reversed torques or coupled positions; None if it is too short."""
-    samples = take_samples(case, bodies_under(chain, gravity), MAX_SAMPLES)
+    bodies = bodies_under(chain, gravity)
+    samples = take_samples(case, bodies, MAX_SAMPLES)
     return None if samples is None else wrong_joints(samples)
 
 
@@ -379,10 +391,14 @@ def _speed_ratio(
         part = slice(start, stop)
         step = np.diff(t[part])[:, None]
         mean_velocity = (v[start + 1 : stop] + v[start : stop - 1]) / 2
-        integral[part] = np.concatenate([0.0 * v[start : start + 1], np.cumsum(mean_velocity * step, axis=0)])
-        trend = np.column_stack([np.ones(stop - start), t[part] - t[part].mean()])
-        position[part] -= trend @ np.linalg.lstsq(trend, position[part], rcond=None)[0]
-        integral[part] -= trend @ np.linalg.lstsq(trend, integral[part], rcond=None)[0]
+        travelled = np.cumsum(mean_velocity * step, axis=0)
+        integral[part] = np.concatenate([0.0 * v[start : start + 1], travelled])
+        centred = t[part] - t[part].mean()
+        trend = np.column_stack([np.ones(stop - start), centred])
+        position_trend = np.linalg.lstsq(trend, position[part], rcond=None)[0]
+        position[part] -= trend @ position_trend
+        integral_trend = np.linalg.lstsq(trend, integral[part], rcond=None)[0]
+        integral[part] -= trend @ integral_trend
     power = np.maximum((position**2).sum(axis=0), 1e-300)
     integral_power = np.maximum((integral**2).sum(axis=0), 1e-300)
     ratio = (position * integral).sum(axis=0) / power
@@ -390,6 +406,7 @@ def _speed_ratio(
     travels = travel > MIN_TRAVEL
     follows = np.where(travels, ratio * np.sqrt(power / integral_power), np.nan)
     by_dates = DATE_ERROR * travel / np.maximum(np.ptp(position, axis=0), 1e-300)
-    by_noise = np.sqrt(((integral - ratio * position) ** 2).sum(axis=0) / power / INDEPENDENT_ERRORS)
+    squares = ((integral - ratio * position) ** 2).sum(axis=0)
+    by_noise = np.sqrt(squares / power / INDEPENDENT_ERRORS)
     sigma = np.hypot(by_noise, by_dates)
     return np.where(travels & (follows > FOLLOWS), ratio, np.nan), sigma, follows

@@ -101,7 +101,9 @@ def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
     lag = _lag_in(total)
     half_lags = [_lag_in(first), _lag_in(second)]
     difference = abs(half_lags[0].seconds - half_lags[1].seconds) / 2.0
-    return replace(lag, sigma=float(np.hypot(lag.sigma, difference)), joint=_single_joint(lag, half_lags))
+    sigma = float(np.hypot(lag.sigma, difference))
+    joint = _single_joint(lag, half_lags)
+    return replace(lag, sigma=sigma, joint=joint)
 
 
 def _single_joint(lag: Lag, half_lags: Sequence[Lag]) -> int | None:
@@ -147,8 +149,10 @@ def _rows(samples: MotionSamples, rate: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the columns (n, m, p) of all joints, and their torques (n, S, m) at the lags `SHIFTS`."""
     shifted = samples.index + SHIFTS[:, None] * rate
     times = np.arange(len(samples.effort))
-    torque = np.stack([np.interp(shifted, times, effort) for effort in samples.effort.T])
-    columns = np.concatenate([samples.inertial, samples.drives, *_turning(samples, rate)], axis=2)
+    shifted_efforts = [np.interp(shifted, times, effort) for effort in samples.effort.T]
+    torque = np.stack(shifted_efforts)
+    turning = _turning(samples, rate)
+    columns = np.concatenate([samples.inertial, samples.drives, *turning], axis=2)
     return np.ascontiguousarray(columns.transpose(1, 0, 2)), torque
 
 
@@ -165,12 +169,17 @@ def _lag_in(rows: _LagRows) -> Lag:
     ratio = fit.common[RECORDED] / max(fit.common[best], 1e-300)
     separate = fit.separate_lags(np.full(n, best))
     gains = [fit.gain(separate, joint, best) for joint in range(n)]
+    seconds = float(SHIFTS[best] + between_steps)
+    sigma = float(np.hypot(fit.sigma(best), LAG_SIGMA))
+    factor = float(np.sqrt(ratio))
+    recorded_lags = np.full(n, RECORDED)
+    best_lags = np.full(n, best)
     return Lag(
-        seconds=float(SHIFTS[best] + between_steps),
-        sigma=float(np.hypot(fit.sigma(best), LAG_SIGMA)),
-        before=fit.unexplained_share(np.full(n, RECORDED), spread),
-        after=fit.unexplained_share(np.full(n, best), spread),
-        factor=float(np.sqrt(ratio)),
+        seconds=seconds,
+        sigma=sigma,
+        before=fit.unexplained_share(recorded_lags, spread),
+        after=fit.unexplained_share(best_lags, spread),
+        factor=factor,
         own=SHIFTS[separate],
         gains=np.array(gains),
         joint=None,
@@ -194,8 +203,10 @@ class _LagFit:
         self.rows = rows
         self.weight = weight
         squares = weight**2
-        self.spanning = spanning(np.tensordot(squares, rows.square, 1))
-        self.parts = np.matmul(rows.cross.transpose(0, 2, 1), self.spanning) * squares[:, None, None]
+        square = np.tensordot(squares, rows.square, 1)
+        self.spanning = spanning(square)
+        projected = np.matmul(rows.cross.transpose(0, 2, 1), self.spanning)
+        self.parts = projected * squares[:, None, None]
         self.power = rows.power * squares[:, None]
         explained = (self.parts.sum(axis=0) ** 2).sum(axis=1)
         self.common = self.power.sum(axis=0) - explained
@@ -208,19 +219,22 @@ class _LagFit:
 
     def _unexplained(self, torque: np.ndarray, parts: np.ndarray) -> np.ndarray:
         """Return torques (n, m) without their projections (k,), weighted."""
-        return self.weight[:, None] * (torque - self.rows.columns @ (self.spanning @ parts))
+        explained = self.rows.columns @ (self.spanning @ parts)
+        return self.weight[:, None] * (torque - explained)
 
     def unexplained_share(self, lags: np.ndarray, spread: np.ndarray) -> float:
         """Return the rms share of the torques, each in units of its `spread` (n,), that is unexplained at some lags."""
         deviation = self.residual(lags).std(axis=1) / self.weight
-        return float(np.sqrt(np.mean((deviation / np.maximum(spread, 1e-12)) ** 2)))
+        relative = deviation / np.maximum(spread, 1e-12)
+        return float(np.sqrt(np.mean(relative**2)))
 
     def along(self, lags: np.ndarray, joint: int) -> np.ndarray:
         """Return the squared residual of all joints (shifts,) over one joint's lag; the other lags (n,) stay fixed."""
         fixed = np.flatnonzero(np.arange(len(lags)) != joint)
         fixed_part = self.parts[fixed, lags[fixed]].sum(axis=0)
         explained = ((fixed_part + self.parts[joint]) ** 2).sum(axis=1)
-        return np.asarray(self.power[fixed, lags[fixed]].sum() + self.power[joint] - explained)
+        fixed_power = self.power[fixed, lags[fixed]].sum()
+        return np.asarray(fixed_power + self.power[joint] - explained)
 
     def separate_lags(self, start: np.ndarray) -> np.ndarray:
         """Return the separate least-squares lags of the joints (n,), starting from the given ones."""
@@ -244,10 +258,13 @@ class _LagFit:
         """Return the sigma of a common lag [s], an index of `SHIFTS`; each joint counts as one independent sample."""
         inner = int(np.clip(lag, 1, len(SHIFTS) - 2))
         torque, parts = self.rows.torque, self.parts
-        torque_slope = (torque[:, inner + 1] - torque[:, inner - 1]) / (2.0 * STEP)
-        parts_slope = (parts[:, inner + 1] - parts[:, inner - 1]) / (2.0 * STEP)
+        torque_change = torque[:, inner + 1] - torque[:, inner - 1]
+        torque_slope = torque_change / (2.0 * STEP)
+        parts_change = parts[:, inner + 1] - parts[:, inner - 1]
+        parts_slope = parts_change / (2.0 * STEP)
         slope = self._unexplained(torque_slope, parts_slope.sum(axis=0))
-        votes = (self.residual(np.full(len(slope), inner)) * slope).sum(axis=1)
+        residual = self.residual(np.full(len(slope), inner))
+        votes = (residual * slope).sum(axis=1)
         power = float((slope**2).sum())
         correction = len(votes) / max(len(votes) - 1, 1)
         square = ((votes - votes.mean()) ** 2).sum()
@@ -260,8 +277,10 @@ def _turning(samples: MotionSamples, rate: float) -> list[np.ndarray]:
     regressors = []
     for early in (-FREE_TIME, FREE_TIME):
         shifted = samples.index + early * rate
-        v = np.stack([np.interp(shifted, times, velocity) for velocity in samples.velocity.T], axis=1)
-        regressors.append(np.tanh(v / CREEP)[:, :, None] * np.eye(v.shape[1]))
+        shifted_velocities = [np.interp(shifted, times, velocity) for velocity in samples.velocity.T]
+        v = np.stack(shifted_velocities, axis=1)
+        sign = np.tanh(v / CREEP)[:, :, None]
+        regressors.append(sign * np.eye(v.shape[1]))
     return regressors
 
 

@@ -86,13 +86,15 @@ def unstated_load(samples: Mapping[str, MotionSamples]) -> UnstatedLoad | None:
     before = _size(unloaded.residuals)
     after = sizes[best]
     mass = float(fit.values[MASS])
-    reach = float(np.linalg.norm(fit.values[FIRST_MOMENT])) / max(abs(mass), 1e-12)
+    first_moment = float(np.linalg.norm(fit.values[FIRST_MOMENT]))
+    reach = first_moment / max(abs(mass), 1e-12)
     explained = after < MAX_LEFT * before and after < MAX_BEYOND * _size(separate)
     explained = explained and after < MAX_SCALED * _size(_scaled(rows, best))
     if not explained or mass < MIN_SIGMAS * fit.sigma or reach > MAX_REACH:
         return None
     torque = _size([part[:, :, -1] for part in rows])
-    return UnstatedLoad(names[best], mass, fit.sigma, reach, before / torque, after / torque)
+    name = names[best]
+    return UnstatedLoad(name, mass, fit.sigma, reach, before / torque, after / torque)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +111,8 @@ def _rows(motion: MotionSamples) -> np.ndarray:
     """Return columns (m, n, 10 B + n + 1): bodies, rotors' inertias and torques, without friction and offsets."""
     m, n = motion.q.shape
     drives = motion.drives.reshape(m, n, n, 4)
-    columns = np.concatenate([motion.inertial, drives[..., 0], motion.torque[:, :, None]], axis=2)
+    target = motion.torque[:, :, None]
+    columns = np.concatenate([motion.inertial, drives[..., 0], target], axis=2)
     for joint in range(n):
         friction = basis(drives[:, joint, joint, 1:])
         columns[:, joint] -= friction @ (friction.T @ columns[:, joint])
@@ -124,7 +127,8 @@ def _fit(rows: Sequence[np.ndarray], loaded: int | None) -> _Fit:
     matrices, targets = [], []
     for index, part in enumerate(rows):
         load = part[:, :, last_body] * (index == loaded)
-        matrices.append(np.concatenate([part[:, :, :-1], load], axis=2))
+        columns = part[:, :, :-1]
+        matrices.append(np.concatenate([columns, load], axis=2))
         targets.append(part[:, :, -1])
     residuals = targets
     bodies = np.zeros(size)
@@ -161,9 +165,11 @@ def _scaled(rows: Sequence[np.ndarray], recording: int) -> list[np.ndarray]:
     residuals = []
     for _ in range(ROUNDS):
         expected = part[:, :, :-1] @ fit.bodies
-        factor = np.sum(expected * torque, axis=0) / np.maximum(np.sum(expected**2, axis=0), 1e-300)
+        square = np.maximum(np.sum(expected**2, axis=0), 1e-300)
+        factor = np.sum(expected * torque, axis=0) / square
         changed = np.array(part)
-        changed[:, :, -1] /= np.where(np.abs(factor) > MIN_FACTOR, factor, 1.0)
+        safe_factor = np.where(np.abs(factor) > MIN_FACTOR, factor, 1.0)
+        changed[:, :, -1] /= safe_factor
         fit = _fit([*before, changed, *after], None)
         residuals = list(fit.residuals)
         residuals[recording] = torque - factor * (part[:, :, :-1] @ fit.bodies)
@@ -185,4 +191,6 @@ def _mean_squares(residuals: Sequence[np.ndarray]) -> np.ndarray:
 
 def _size(residuals: Sequence[np.ndarray]) -> float:
     """Return the geometric mean over the joints of the rms of residuals (m, n) of all recordings."""
-    return float(np.exp(0.5 * np.mean(np.log(np.maximum(_mean_squares(residuals), 1e-300)))))
+    squares = np.maximum(_mean_squares(residuals), 1e-300)
+    mean_log = np.mean(np.log(squares))
+    return float(np.exp(0.5 * mean_log))

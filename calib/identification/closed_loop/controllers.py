@@ -34,7 +34,9 @@ class Reference:
     def __post_init__(self) -> None:
         object.__setattr__(self, "t", frozen(self.t))
         for name in ("q", "v", "a"):
-            object.__setattr__(self, name, frozen(shaped(getattr(self, name), np.shape(self.q), name)))
+            shape = np.shape(self.q)
+            values = shaped(getattr(self, name), shape, name)
+            object.__setattr__(self, name, frozen(values))
         if len(self.t) != len(self.q) or len(self.t) < 2:
             raise CalibError(
                 f"{len(self.t)} times, {len(self.q)} positions: a reference needs equal numbers, at least 2"
@@ -43,7 +45,8 @@ class Reference:
     @property
     def period(self) -> float:
         """The control period [s]."""
-        return float(self.t[-1] - self.t[0]) / (len(self.t) - 1)
+        seconds = float(self.t[-1] - self.t[0])
+        return seconds / (len(self.t) - 1)
 
     def sampled(self, ahead: np.ndarray | None) -> np.ndarray:
         """Return position, velocity, feedforward torque `ahead` (N, n) and acceleration as one array (4, N, n)."""
@@ -70,7 +73,9 @@ def pd(
     kp: np.ndarray, kd: np.ndarray, limit: np.ndarray | float = np.inf, ki: np.ndarray | float = 0.0
 ) -> LoopController:
     """Return a PD (or PID) controller."""
-    return LoopController(kp, kd, np.asarray(ki), np.asarray(1.0), np.asarray(limit), np.asarray(np.inf))
+    share = np.asarray(1.0)
+    windup = np.asarray(np.inf)
+    return LoopController(kp, kd, np.asarray(ki), share, np.asarray(limit), windup)
 
 
 def cascade(
@@ -96,7 +101,8 @@ def cascade(
     velocity = np.asarray(velocity, dtype=float)
     ki = velocity * position / np.asarray(reset, dtype=float)
     kp = velocity * (position + 1.0 / np.asarray(reset, dtype=float))
-    return LoopController(kp, velocity, ki, np.asarray(share), np.asarray(limit), np.asarray(np.inf))
+    windup = np.asarray(np.inf)
+    return LoopController(kp, velocity, ki, np.asarray(share), np.asarray(limit), windup)
 
 
 def computed_torque(
@@ -110,20 +116,19 @@ def computed_torque(
     """
     kp = np.full(n, frequency**2)
     kd = np.full(n, 2 * damping * frequency)
-    return LoopController(kp, kd, np.zeros(n), np.ones(n), np.asarray(limit), np.asarray(np.inf), model=frozen(model))
+    no_integral = np.zeros(n)
+    share = np.ones(n)
+    windup = np.asarray(np.inf)
+    return LoopController(kp, kd, no_integral, share, np.asarray(limit), windup, model=frozen(model))
 
 
 def completed(controller: LoopController, loop: LoopSettings, n: int) -> LoopController:
     """Return the controller with the saturation, delay and velocity filter given in the settings."""
+    share = np.full(n, loop.share)
+    limit = loop.per_joint("limit", n)
+    windup = loop.per_joint("windup", n)
     return LoopController(
-        controller.kp,
-        controller.kd,
-        controller.ki,
-        np.full(n, loop.share),
-        loop.per_joint("limit", n),
-        loop.per_joint("windup", n),
-        delay=loop.delay,
-        cutoff=loop.velocity_cutoff,
+        controller.kp, controller.kd, controller.ki, share, limit, windup, delay=loop.delay, cutoff=loop.velocity_cutoff
     )
 
 
@@ -141,7 +146,8 @@ def stated_controller(loop: LoopSettings, n: int) -> LoopController:
     kp = loop.per_joint("kp", n)
     kd = loop.per_joint("kd", n)
     ki = loop.per_joint("ki", n)
-    return completed(pd(kp, kd, ki=ki), loop, n)
+    controller = pd(kp, kd, ki=ki)
+    return completed(controller, loop, n)
 
 
 # [Hz] the usual bandwidth of an industrial position loop
@@ -186,11 +192,13 @@ def identify_controller(
         MeasurementError: where reference and log do not fit together, or the error is zero.
     """
     error = _error(reference, measured, rate)
-    tau = shaped(tau, np.shape(measured), "torques")
+    shape = np.shape(measured)
+    tau = shaped(tau, shape, "torques")
     error = low_pass(error, rate, band)
     tau = low_pass(tau, rate, band)
     edge = border(rate, band)
-    basis = np.linalg.qr(_instruments(reference, len(error), rate, band)[edge:-edge])[0]
+    instruments = _instruments(reference, len(error), rate, band)[edge:-edge]
+    basis = np.linalg.qr(instruments)[0]
     joint_gains = []
     explained = []
     for joint_error, joint_tau in zip(error.T, tau.T):
@@ -198,18 +206,23 @@ def identify_controller(
         joint_gains.append(_read(past, errors, rate, band, integral))
         explained.append(_explained(joint_error, joint_tau, joint_gains[-1], rate, band))
     gains = np.array(joint_gains)
-    controller = pd(gains[:, 0], gains[:, 1], ki=gains[:, 2])
+    ki = gains[:, 2]
+    kp = gains[:, 0]
+    kd = gains[:, 1]
+    controller = pd(kp, kd, ki=ki)
     return IdentifiedController(controller, frozen(explained))
 
 
 def _error(reference: Reference, measured: np.ndarray, rate: float) -> np.ndarray:
-    tick = _ticks(reference, rate, len(measured))
+    count = len(measured)
+    tick = _ticks(reference, rate, count)
     if rate * reference.period > 1.0 + 1e-3 or tick[-1] > len(reference.t) - 1:
         raise MeasurementError(
             f"a log of {len(measured)} samples at {rate:g} Hz does not match a reference of {len(reference.t)} samples "
             f"at {1 / reference.period:g} Hz"
         )
-    return reference.at(tick)[0] - shaped(measured, (None, reference.q.shape[1]), "measured positions")
+    desired, *_ = reference.at(tick)
+    return desired - shaped(measured, (None, reference.q.shape[1]), "measured positions")
 
 
 def _ticks(reference: Reference, rate: float, count: int) -> np.ndarray:
@@ -224,8 +237,10 @@ def _instruments(reference: Reference, count: int, rate: float, band: float) -> 
     """Return the instruments (count, k), functions of the reference: friction, inertia and gravity, low-passed."""
     q, v, a = reference.at(_ticks(reference, rate, count))
     jerk = np.gradient(a, 1.0 / rate, axis=0)
-    slow = np.tanh(v / (0.01 * np.abs(v).max(axis=0, initial=1e-9)))
-    parts = [v, a, jerk, slow, np.gradient(slow, 1.0 / rate, axis=0), np.sin(q), np.cos(q)]
+    peak = np.abs(v).max(axis=0, initial=1e-9)
+    slow = np.tanh(v / (0.01 * peak))
+    jerk_of_slow = np.gradient(slow, 1.0 / rate, axis=0)
+    parts = [v, a, jerk, slow, jerk_of_slow, np.sin(q), np.cos(q)]
     series = low_pass(np.hstack(parts), rate, band)
     size = np.maximum(np.linalg.norm(series, axis=0), 1e-12)
     return np.column_stack([series / size, np.ones(count)])
@@ -243,9 +258,14 @@ def _joint(
     rows = basis[first:]
     columns = [tau[first - i : count - i] for i in range(1, na + 1)]
     columns += [error[first - i : count - i] for i in range(nb + 1)]
-    matrix = np.column_stack([rows @ (rows.T @ np.column_stack(columns)), np.ones(count - first)])
+    stacked = np.column_stack(columns)
+    offset = np.ones(count - first)
+    projected = rows @ (rows.T @ stacked)
+    matrix = np.column_stack([projected, offset])
     size = np.linalg.norm(matrix, axis=0)
-    values = np.linalg.lstsq(matrix / size, rows @ (rows.T @ tau[first:]), rcond=None)[0] / size
+    projected_torque = rows @ (rows.T @ tau[first:])
+    solution, *_ = np.linalg.lstsq(matrix / size, projected_torque, rcond=None)
+    values = solution / size
     return values[:na], values[na:-1]
 
 
@@ -253,24 +273,30 @@ def _read(past: np.ndarray, errors: np.ndarray, rate: float, band: float, integr
     """Return the kp, kd, ki (3,) that fit the ARX model's frequency response best, from 1/40 to 1/2 of the band."""
     omega = 2.0 * np.pi * np.geomspace(band / 40.0, band / 2.0, 60)
     shift = np.exp(-1j * omega / rate)
-    response = np.polyval(errors[::-1], shift) / (1.0 - shift * np.polyval(past[::-1], shift))
+    numerator = np.polyval(errors[::-1], shift)
+    denominator = 1.0 - shift * np.polyval(past[::-1], shift)
+    response = numerator / denominator
     columns = [np.ones_like(omega), 1j * omega]
     if integral:
         columns.append(1.0 / (1j * omega))
     matrix = np.column_stack(columns) / np.abs(response)[:, None]
     target = response / np.abs(response)
     stacked = np.vstack([matrix.real, matrix.imag])
-    gains = np.linalg.lstsq(stacked, np.concatenate([target.real, target.imag]), rcond=None)[0]
+    stacked_target = np.concatenate([target.real, target.imag])
+    gains = np.linalg.lstsq(stacked, stacked_target, rcond=None)[0]
     return np.append(gains, np.zeros(3 - len(gains)))
 
 
 def _explained(error: np.ndarray, tau: np.ndarray, gains: np.ndarray, rate: float, band: float) -> float:
     """Return the share of the low-passed torque explained by the gains (n,) [%]."""
     kp, kd, ki = gains
-    feedback = kp * error + kd * np.gradient(error, 1.0 / rate) + ki * np.cumsum(error) / rate
+    rate_of_error = np.gradient(error, 1.0 / rate)
+    integral = np.cumsum(error)
+    feedback = kp * error + kd * rate_of_error + ki * integral / rate
     edge = border(rate, band)
     residual = (tau - feedback)[edge:-edge]
     residual = residual - residual.mean()
     torque = tau[edge:-edge]
     torque = torque - torque.mean()
-    return float(100.0 * (1.0 - np.linalg.norm(residual) / np.linalg.norm(torque)))
+    share = np.linalg.norm(residual) / np.linalg.norm(torque)
+    return float(100.0 * (1.0 - share))

@@ -24,7 +24,7 @@ import numpy as np
 from calib.data.signals.filtering import Decimator, low_pass, slope
 from calib.data.signals.motion import Motion
 from calib.dynamics.base import Base
-from calib.dynamics.drives import DriveTerm, standard
+from calib.dynamics.drives import DriveTerm
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.torque_rows import POWER
 from calib.errors import CalibError, CannotSimulate, Diverged, NotConverged, UsageError, one_of
@@ -33,8 +33,19 @@ from calib.estimation.triangles import Triangles, combine
 from calib.estimation.whiteness import inflation
 from calib.identification.closed_loop import instrumental_variables
 from calib.identification.closed_loop.instrumental_variables import Instruments, InstrumentStrength
-from calib.identification.closed_loop.loop_recordings import Loop, low_passed, simulated_case, simulated_samples
-from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun, plant_of
+from calib.identification.closed_loop.loop_recordings import Loop, simulated_case
+from calib.identification.closed_loop.simulated_runs import (
+    MAX_GAIN_RATIO,
+    MAX_RETREATS,
+    Runs,
+    between,
+    distance_percent,
+    error_ratio,
+    nearer,
+    regular_plant,
+    simulated_runs,
+)
+from calib.identification.closed_loop.simulation import Plant
 from calib.identification.loop import ExogeneityTest
 from calib.identification.methods.constraint_settings import ConstraintSettings, Held
 from calib.identification.methods.parameter_constraints import Constraints, hold, make_constraints
@@ -43,12 +54,8 @@ from calib.records import frozen
 
 # iterations; 3 to 6 are usual
 MAX_ROUNDS = 10
-# halvings of a step to parameters that cannot be simulated (our choice)
-MAX_RETREATS = 6
 # times the speed's noise, by which the simulated motion may be off the measured one (our choice)
 MAX_FOLLOWING = 1.25
-# of distances from the reference, recorded and simulated: beyond, gains are others (our choice)
-MAX_GAIN_RATIO = 1.25
 
 
 @dataclass(frozen=True)
@@ -66,9 +73,6 @@ class _RoundEstimator:
     fit: Callable[[Instruments, np.ndarray, float], LinearFit]
     triangle: Callable[[Instruments, np.ndarray], np.ndarray]
     measured: bool
-
-
-Runs = list[tuple[tuple[Case, Loop], SimulatedRun]]
 
 
 @dataclass(frozen=True)
@@ -136,19 +140,22 @@ class Instrumental:
 
     def simulated_error(self, values: np.ndarray) -> np.ndarray:
         """Return the relative torque errors (n,) on the simulated motion, of values (p,): 100 ‖y - Z x‖ / ‖y‖ [%]."""
-        return self.problem.data.relative_errors(np.concatenate([values, np.zeros(len(self.names))]))
+        with_instruments = np.concatenate([values, np.zeros(len(self.names))])
+        return self.problem.data.relative_errors(with_instruments)
 
     @property
     def own(self) -> np.ndarray:
         """Relative error of the measured motion's torque (n,): 100 ‖y - W x‖ / ‖y‖ [%]."""
-        return self.problem.data.relative_errors(np.concatenate([np.zeros(len(self.names)), self.fit.estimate.values]))
+        by_measured = np.concatenate([np.zeros(len(self.names)), self.fit.estimate.values])
+        return self.problem.data.relative_errors(by_measured)
 
     @property
     def off(self) -> np.ndarray:
         """Joints (from 0) whose given gains are wrong: recorded and simulated tracking errors differ."""
         estimate = self.fit.estimate
         simulated = self.problem.data.factors[:, :, : len(self.names)]
-        sizes = np.maximum(np.sum((simulated @ estimate.values) ** 2, axis=1), 1e-300)
+        explained = np.sum((simulated @ estimate.values) ** 2, axis=1)
+        sizes = np.maximum(explained, 1e-300)
         # the torques' share that is unsure makes e_s = q_ref - q_s unsure, too
         unsure = np.sqrt(np.einsum("gij,jk,gik->g", simulated, estimate.covariance, simulated) / sizes)
         # rows of the motors
@@ -156,7 +163,8 @@ class Instrumental:
             unsure = unsure[-len(self.stray) :]
         else:
             unsure = unsure.max()
-        away = np.abs(np.log(np.maximum(np.nan_to_num(self.stray, nan=1.0), 1e-3)))
+        ratio = np.maximum(np.nan_to_num(self.stray, nan=1.0), 1e-3)
+        away = np.abs(np.log(ratio))
         return np.flatnonzero(away > np.log(MAX_GAIN_RATIO) + 5.0 * unsure)
 
     @property
@@ -178,7 +186,9 @@ class Instrumental:
         The test finds any bias that the data can detect; this says whether it matters.
         """
         estimate = self.fit.estimate
-        return np.abs(self.ordinary.estimate.values - estimate.values) / np.where(estimate.sigma > 0, estimate.sigma, 1)
+        difference = np.abs(self.ordinary.estimate.values - estimate.values)
+        sigma = np.where(estimate.sigma > 0, estimate.sigma, 1)
+        return difference / sigma
 
     @property
     def apart(self) -> np.ndarray:
@@ -243,28 +253,31 @@ def identify_instrumental(
     observed, friction = _observed_with_friction(model, base, cases, decimator, terms)
     data = pool(triangulate(observed), model.rows)
     if constraints is None and positive:
-        settings = ConstraintSettings(signs=False, inertia=0, bounds=dict.fromkeys(positive, (0.0, np.inf)))
+        bounds = dict.fromkeys(positive, (0.0, np.inf))
+        settings = ConstraintSettings(signs=False, inertia=0, bounds=bounds)
         constraints = make_constraints(settings, model, base, base.names, [None] * base.b)
-    task = _Fixed(model, base, cases, decimator, observed, ROUNDS[method], constraints, friction)
+    estimator = ROUNDS[method]
+    task = _Fixed(model, base, cases, decimator, observed, estimator, constraints, friction)
     ordinary = wls(data, settled_std(data, 1e-3))
-    plant = _regular(model, friction.terms, cases[0][1], inertia)
+    loop = cases[0][1]
+    plant = regular_plant(model, friction.terms, loop, inertia)
     std = ordinary.group_std
     before: LinearFit | None = None
     rounds: list[Round] = []
     try:
-        runs = _runs(plant, cases)
+        runs = simulated_runs(plant, cases)
         retreats = 0
         tau = 1.0
     except NotConverged as error:
         raise CannotSimulate(str(error), error.last) from error
     # of the last step, and how often it was halved afterwards
     start, returns = plant, 0
-    round_count = 0
     while True:
-        round_count += 1
         estimate = _estimate_round(task, runs, std, tau)
         task = task.after(estimate)
-        rounds.append(Round(_change(before, estimate.fit), estimate.fit.estimate.residual_std, retreats))
+        residual_std = estimate.fit.estimate.residual_std
+        iteration = Round(_change(before, estimate.fit), residual_std, retreats)
+        rounds.append(iteration)
         if before is not None and retreats == 0 and instrumental_variables.settled(before, estimate.fit):
             return _result(task, estimate, ordinary, task.plant(plant, estimate), rounds, std, runs)
         try:
@@ -275,11 +288,13 @@ def identify_instrumental(
             returns += 1
             if returns > MAX_RETREATS or plant is start:
                 raise
-            plant, runs = _nearer(start, plant, cases)
+            plant, runs = nearer(start, plant, cases)
             retreats = returns
         before = estimate.fit
         std = estimate.fit.group_std
         tau = estimate.tau
+        if len(rounds) >= limit:
+            break
     change_percent = 100 * rounds[-1].change
     message = (
         f"instruments from simulation: parameters still change by {change_percent:.3g} % after {limit} "
@@ -305,7 +320,8 @@ def _observed_with_friction(
     if not terms:
         return observed, _Friction((), model, decimator, None)
     data = pool(triangulate(observed), model.rows)
-    ordinary = wls(data, settled_std(data, 1e-3))
+    std = settled_std(data, 1e-3)
+    ordinary = wls(data, std)
     loads = base.to_standard(ordinary.estimate.values)
     friction = _Friction(tuple(terms), model, decimator, loads)
     richer = [friction.added(part, case) for part, (case, _) in zip(observed, cases)]
@@ -327,7 +343,8 @@ class _Friction:
             return rows
         motion = case.motion
         load = self.model.transmitted(self.loads, motion.q, motion.v, motion.a, case.carried)
-        return rows.extend(self.terms, observe_terms(self.terms, case, self.decimator, load, self.model.torque_rows))
+        columns = observe_terms(self.terms, case, self.decimator, load, self.model.torque_rows)
+        return rows.extend(self.terms, columns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -347,13 +364,15 @@ class _Fixed:
         """Return the settings of the next iteration, which starts from the postures whose constraints are binding."""
         if self.constraints is None or estimate.bound is None:
             return self
-        return replace(self, constraints=replace(self.constraints, likely=estimate.bound.tight))
+        constraints = replace(self.constraints, likely=estimate.bound.tight)
+        return replace(self, constraints=constraints)
 
     def plant(self, old: Plant, estimate: _Found) -> Plant:
         """Return the simulated robot with an estimate; without motor torques, its motor inertias J are unchanged."""
         estimated = estimate.fit.estimate.values
         b = self.base.b
-        values = np.concatenate([self.base.to_standard(estimated[:b]), estimated[b:]])
+        standard = self.base.to_standard(estimated[:b])
+        values = np.concatenate([standard, estimated[b:]])
         regular = old.parameters[len(values) :] * (not self.model.torque_rows.driven)
         return old.with_parameters(np.concatenate([values, regular]))
 
@@ -400,7 +419,8 @@ def _with_signs(
         return rows
     motion = case.motion
     band = 0.5 * case.motion.band
-    measured = slope(low_pass(case.motion.q, motion.rate, band), motion.rate)
+    values = low_pass(case.motion.q, motion.rate, band)
+    measured = slope(values, motion.rate)
     expected = slope(low_pass(simulated_case.motion.q, motion.rate, band), motion.rate)
     away = np.sqrt(np.nanmean((measured - expected) ** 2, axis=0))
     followed = away <= MAX_FOLLOWING * motion.velocity_noise(band)
@@ -410,7 +430,8 @@ def _with_signs(
         sign_rows = observe(task.model, columns[signs], case_at_speed, task.decimator)
         simulated = simulated.copy()
         simulated[:, :, drowned] = sign_rows.matrix
-    return replace(rows, matrix=np.where(drowned, simulated, rows.matrix))
+    matrix = np.where(drowned, simulated, rows.matrix)
+    return replace(rows, matrix=matrix)
 
 
 def sign_noise(model: Any, motion: Motion) -> np.ndarray:
@@ -460,6 +481,8 @@ def _result(
             rows.append((case, observed, simulated))
         else:
             rows.append((simulated_case(case, run, loop), replace(observed, matrix=simulated), simulated))
+    distance = distance_percent(runs)
+    stray = error_ratio(runs)
     return Instrumental(
         fit,
         ordinary,
@@ -469,37 +492,13 @@ def _result(
         verdict,
         frozen(std),
         estimate.tau,
-        _distance(runs),
-        _stray(runs),
+        distance,
+        stray,
         bound,
         problem,
         task.estimator,
         tuple(rows),
     )
-
-
-def _regular(model: IdentificationModel, terms: Sequence[DriveTerm], loop: Loop, inertia: np.ndarray | None) -> Plant:
-    """Return the robot of the first simulation: joint inertias J (its last n parameters), no bodies, no gravity."""
-    if inertia is None:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            inertia = loop.controller.kd**2 / (2.0 * loop.controller.kp)
-        if not np.all(np.isfinite(inertia)) or not np.all(inertia > 0.0):
-            raise UsageError("kd² / (2 kp) of these gains is no inertia above 0; give the inertia (n,) [kg m²]")
-    extra = tuple(replace(motor, name=f"regular {motor.name}") for motor in standard(["Ia"] * model.n))
-    values = np.concatenate([np.zeros(model.p + len(terms)), inertia])
-    return plant_of(model, values, (*terms, *extra))
-
-
-def _runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
-    """Return the noise-free simulation of every recording's loop."""
-    result: Runs = []
-    for case, loop in cases:
-        robot = plant.carrying(case.carried)
-        controller = loop.controller
-        if loop.design is not None:
-            controller = controller.scaled(robot.inertia_diagonal(loop.reference.q[::200]) / loop.design)
-        result.append(((case, loop), robot.run(controller, loop.reference, Sensing(every=loop.every))))
-    return result
 
 
 def _simulate_new(
@@ -511,9 +510,10 @@ def _simulate_new(
     """
     retreats = 0
     while True:
-        candidate = _between(old, task.plant(old, estimate), 0.5**retreats)
+        end = task.plant(old, estimate)
+        candidate = between(old, end, 0.5**retreats)
         try:
-            return task, estimate, candidate, _runs(candidate, task.cases), retreats
+            return task, estimate, candidate, simulated_runs(candidate, task.cases), retreats
         except CalibError as error:
             problem = error
         if task.constraints and estimate.bound and estimate.bound.postures:
@@ -532,27 +532,6 @@ def _simulate_new(
             break
     message = f"neither the estimate nor smaller steps can be simulated: {problem}{_if_weak(task, estimate, std)}"
     raise CannotSimulate(message, task.plant(old, estimate))
-
-
-def _between(start: Plant, end: Plant, share: float) -> Plant:
-    """Return the plant whose parameters are a share of the way from one plant to another."""
-    return end.with_parameters(share * end.parameters + (1.0 - share) * start.parameters)
-
-
-def _nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tuple[Plant, Runs]:
-    """Return the plant halfway from `start` to `end`, or nearer where that cannot be simulated, and its runs.
-
-    Raises:
-        CannotSimulate: where none near `start` can.
-    """
-    problem: CalibError | None = None
-    for halvings in range(1, MAX_RETREATS + 1):
-        candidate = _between(start, end, 0.5**halvings)
-        try:
-            return candidate, _runs(candidate, cases)
-        except CalibError as error:
-            problem = error
-    raise CannotSimulate(f"no robot on the way to the estimate can be simulated: {problem}", start)
 
 
 def _if_weak(task: _Fixed, estimate: _Found, std: np.ndarray) -> str:
@@ -589,7 +568,8 @@ def _stack(observed: Sequence[ObservationRows], simulated: Sequence[np.ndarray],
 
 def _simulated(problem: Instruments) -> Triangles:
     """Return the R factors of [Z y], selected from those of [Z W y]."""
-    return replace(problem.data.select(np.arange(len(problem.names))), names=problem.names)
+    instruments = np.arange(len(problem.names))
+    return replace(problem.data.select(instruments), names=problem.names)
 
 
 def _inflation(observed: Sequence[ObservationRows], fit: LinearFit) -> float:
@@ -610,55 +590,27 @@ def _held_fit(task: _Fixed, problem: Instruments, std: np.ndarray, tau: float) -
         data = problem.least_squares()
     else:
         data = _simulated(problem)
-    return hold(fit, estimator.triangle(problem, std), data, std, task.constraints, stated_noise=not estimator.measured)
+    stated_noise = not estimator.measured
+    factor = estimator.triangle(problem, std)
+    return hold(fit, factor, data, std, task.constraints, stated_noise=stated_noise)
 
 
 def _change(before: LinearFit | None, after: LinearFit) -> float:
     if before is None:
         return float("inf")
     size = np.maximum(np.abs(before.estimate.values), 8.0 * after.estimate.sigma)
-    return float(np.max(np.abs(after.estimate.values - before.estimate.values) / np.maximum(size, 1e-300)))
-
-
-def _distance(runs: Runs) -> np.ndarray:
-    """Return the position difference of simulated and recorded robot (n,), relative to the travel [%]."""
-    away, size = np.zeros((2, runs[0][0][0].motion.n))
-    for (case, loop), run in runs:
-        motion = case.motion
-        simulated = low_passed(run.q, motion)[simulated_samples(case, run.t, loop)]
-        away += np.sum((motion.q - simulated) ** 2, axis=0)
-        size += np.sum((motion.q - motion.q.mean(axis=0)) ** 2, axis=0)
-    return frozen(100.0 * np.sqrt(away / size))
-
-
-def _stray(runs: Runs) -> np.ndarray:
-    """Return the ratios (n,) of recorded to simulated tracking errors, by regression; NaN where noise hides them."""
-    measured_errors = []
-    expected_errors = []
-    for (case, loop), run in runs:
-        motion = case.motion
-        samples = simulated_samples(case, run.t, loop)
-        reference = loop.reference.at(np.arange(len(run.t)) * loop.every)[0]
-        reference = low_passed(reference, motion)[samples]
-        position = low_passed(run.q, motion)[samples]
-        measured_errors.append(reference - motion.q)
-        expected_errors.append(reference - position)
-    measured = np.concatenate(measured_errors)
-    expected = np.concatenate(expected_errors)
-    size = np.maximum(np.sum(expected**2, axis=0), 1e-300)
-    slope = np.sum(measured * expected, axis=0) / size
-    residual = measured - slope * expected
-    inflations = np.array([inflation(joint) for joint in residual.T])
-    sigma = np.sqrt(inflations * np.mean(residual**2, axis=0) / size)
-    return frozen(np.where(5.0 * sigma < np.abs(slope) * np.log(MAX_GAIN_RATIO), slope, np.nan))
+    change = np.abs(after.estimate.values - before.estimate.values)
+    return float(np.max(change / np.maximum(size, 1e-300)))
 
 
 def _fit_simulated(problem: Instruments, std: np.ndarray, tau: float) -> LinearFit:
-    return wls(_simulated(problem), std, np.full(problem.data.groups, tau))
+    data = _simulated(problem)
+    return wls(data, std, np.full(problem.data.groups, tau))
 
 
 def _combine_simulated(problem: Instruments, std: np.ndarray) -> np.ndarray:
-    return combine(_simulated(problem), std)
+    data = _simulated(problem)
+    return combine(data, std)
 
 
 ROUNDS = {

@@ -84,11 +84,13 @@ class Instruments:
         """
         p = len(self.names)
         sigma = np.ones(self.data.groups) if std is None else std
-        squares = self.data.residual_squares(np.concatenate([np.zeros(p), fit.estimate.values]))
+        by_measured = np.concatenate([np.zeros(p), fit.estimate.values])
+        squares = self.data.residual_squares(by_measured)
         factor = np.zeros((1, p + 1, p + 1))
         factor[0, :p] = projected(self, sigma)[:p]
         factor[0, p, p] = np.sqrt(np.sum(squares / sigma**2))
-        return replace(empty(self.names, self.data.units[p:], 1), factors=factor, rows=self.data.rows.sum()[None])
+        rows = self.data.rows.sum()[None]
+        return replace(empty(self.names, self.data.units[p:], 1), factors=factor, rows=rows)
 
 
 def instrument(
@@ -110,7 +112,8 @@ def instrument(
         names, units: of W's columns.
         before: earlier rows of the same problem.
     """
-    matrix = shaped(matrix, (None, None), "observation matrix W")
+    shape = (None, None)
+    matrix = shaped(matrix, shape, "observation matrix W")
     instruments = shaped(instruments, matrix.shape, "instruments Z")
     if before is None:
         if names is None:
@@ -119,12 +122,14 @@ def instrument(
             units = ("",) * len(names)
         groups = int(np.max(group, initial=0)) + 1
         before = unseen(tuple(names), units, groups)
-    return replace(before, data=absorb(before.data, np.hstack([instruments, matrix]), target, group))
+    data = absorb(before.data, np.hstack([instruments, matrix]), target, group)
+    return replace(before, data=data)
 
 
 def unseen(names: Sequence[str], units: Sequence[str], groups: int) -> Instruments:
     """Return empty R factors of [Z W y], for columns of W with these names and units."""
-    return Instruments(empty([*(f"Z {name}" for name in names), *names], [*units, *units], groups))
+    data = empty([*(f"Z {name}" for name in names), *names], [*units, *units], groups)
+    return Instruments(data)
 
 
 def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> LinearFit:
@@ -146,18 +151,21 @@ def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1
     if std is None:
         sigma = np.ones(problem.data.groups)
     else:
-        sigma = shaped(std, (problem.data.groups,), "std per group")
+        shape = (problem.data.groups,)
+        sigma = shaped(std, shape, "std per group")
     factor = combine(problem.data, sigma)
     values, inverse, _ = solve_triangle(_projected(factor, problem.names), problem.names)
     squares = problem.data.residual_squares(np.concatenate([np.zeros(p), values]))
-    degrees = problem.data.rows - inflation * p * problem.data.rows / problem.data.rows.sum()
+    rows = problem.data.rows
+    degrees = rows - inflation * p * rows / rows.sum()
     dof = int(problem.data.rows.sum() / inflation) - p
     require(dof > 0, "fewer independent rows than parameters; record longer motion", Unidentifiable, problem.names)
     residual_std = float(np.sqrt(np.sum(squares / sigma**2) / degrees.sum()))
     covariance = inflation * residual_std**2 * inverse @ inverse.T
     units = problem.data.units[p:]
     estimate = Estimate(problem.names, units, values, covariance, residual_std, dof)
-    return LinearFit(estimate, np.sqrt(squares / degrees), *condition_numbers(factor[:, p : 2 * p]))
+    group_std = np.sqrt(squares / degrees)
+    return LinearFit(estimate, group_std, *condition_numbers(factor[:, p : 2 * p]))
 
 
 def settled(before: LinearFit, after: LinearFit, change: float = 0.025, residual: float = 0.025) -> bool:
@@ -168,9 +176,11 @@ def settled(before: LinearFit, after: LinearFit, change: float = 0.025, residual
     one near zero never meets a relative rule).
     """
     parameter_change = np.abs(after.estimate.values - before.estimate.values)
-    allowed = np.maximum(change * np.abs(before.estimate.values), 0.2 * after.estimate.sigma)
+    by_value = change * np.abs(before.estimate.values)
+    allowed = np.maximum(by_value, 0.2 * after.estimate.sigma)
     sizes = before.estimate.residual_std, after.estimate.residual_std
-    return bool(np.all(parameter_change <= allowed) and abs(sizes[1] - sizes[0]) <= residual * sizes[0])
+    residual_change = abs(sizes[1] - sizes[0])
+    return bool(np.all(parameter_change <= allowed) and residual_change <= residual * sizes[0])
 
 
 def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentStrength:
@@ -185,15 +195,20 @@ def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentS
     factor = combine(problem.data, std)
     explained = factor[:p, p : 2 * p]
     norms = np.linalg.norm(factor[:, p : 2 * p], axis=0)
-    basis = np.linalg.qr(factor[: 2 * p, p : 2 * p] / norms)[0]
-    correlations = np.clip(np.linalg.svd(basis[:p], compute_uv=False), 0.0, 1.0)
-    instruments = factor[:p, :p] / np.linalg.norm(factor[:p, :p], axis=0)
+    normalised = factor[: 2 * p, p : 2 * p] / norms
+    basis = np.linalg.qr(normalised)[0]
+    singular_values = np.linalg.svd(basis[:p], compute_uv=False)
+    correlations = np.clip(singular_values, 0.0, 1.0)
+    instrument_norms = np.linalg.norm(factor[:p, :p], axis=0)
+    instruments = factor[:p, :p] / instrument_norms
     cross = instruments.T @ (explained / norms)
     minimum = correlations[-1] ** 2
     with np.errstate(divide="ignore", invalid="ignore"):
         donald = float((rows - p) / p * np.divide(minimum, 1.0 - minimum))
-    partial_r2 = _shea(explained / norms, factor[:, p : 2 * p] / norms)
-    return InstrumentStrength(problem.names, correlations, partial_r2, donald, np.linalg.cond(cross))
+    total = factor[:, p : 2 * p] / norms
+    partial_r2 = _shea(explained / norms, total)
+    condition = np.linalg.cond(cross)
+    return InstrumentStrength(problem.names, correlations, partial_r2, donald, condition)
 
 
 def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> ExogeneityTest:
@@ -213,8 +228,10 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
     factor = combine(problem.data, std)
     instrument_rows = factor[:, p : 2 * p]
     norms = np.linalg.norm(instrument_rows, axis=0)
-    require_rank(instrument_rows / np.where(norms > 0.0, norms, 1.0), problem.names)
-    part = np.vstack([np.zeros((p, p)), factor[p:, p : 2 * p]])
+    scaled = instrument_rows / np.where(norms > 0.0, norms, 1.0)
+    require_rank(scaled, problem.names)
+    unused = np.zeros((p, p))
+    part = np.vstack([unused, factor[p:, p : 2 * p]])
     size = np.linalg.norm(part, axis=0) > 1e-8 * norms
     columns = np.hstack([instrument_rows, part[:, size]])
     split = split_columns(columns, [np.arange(p)], 1e-8)
@@ -223,12 +240,15 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
     require(k > 0 and dof > 0, "nothing to test: the instruments equal the columns, or there are too few rows")
     target = factor[:, -1]
     first = _rss(instrument_rows, target)
-    second = _rss(columns[:, split.kept], target)
+    matrix = columns[:, split.kept]
+    second = _rss(matrix, target)
     if second > 0.0:
         f = (first - second) / k / (second / (rows - p - k)) / inflation
     else:
         f = np.inf
-    return ExogeneityTest(float(f), (k, dof), float(fdtrc(k, dof, f)))
+    statistic = float(f)
+    degrees = (k, dof)
+    return ExogeneityTest(statistic, degrees, float(fdtrc(k, dof, f)))
 
 
 def projected(problem: Instruments, std: np.ndarray | None = None) -> np.ndarray:
@@ -263,25 +283,28 @@ def by_free_instruments(
     z = factor[:p, :p] @ free
     w = factor[:p, p : 2 * p] @ free
     residual = factor[:p, -1] - factor[:p, p : 2 * p] @ constrained
-    return np.asarray(constrained + free @ np.linalg.solve(z.T @ w, z.T @ residual))
+    by_free = np.linalg.solve(z.T @ w, z.T @ residual)
+    return np.asarray(constrained + free @ by_free)
 
 
 def _projected(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
     """Return the R factor of P_Z [W y]; refuse Z and Zᵀ W without full rank."""
     p = len(names)
     size = np.linalg.norm(factor[:p, :p], axis=0)
+    normalised = factor[:p, :p] / np.where(size > 0.0, size, 1.0)
+    labels = [f"instrument of {name}" for name in names]
     require_rank(
-        factor[:p, :p] / np.where(size > 0.0, size, 1.0),
-        [f"instrument of {name}" for name in names],
-        "the simulated motion does not excite them: simulate the reference of this recording",
+        normalised, labels, "the simulated motion does not excite them: simulate the reference of this recording"
     )
     norms = np.linalg.norm(factor[:, p : 2 * p], axis=0)
+    normalised = factor[:p, p : 2 * p] / np.where(norms > 0.0, norms, 1.0)
     require_rank(
-        factor[:p, p : 2 * p] / np.where(norms > 0.0, norms, 1.0),
+        normalised,
         names,
         "the instruments do not distinguish them: W has dependent columns, or the simulated motion differs",
     )
-    return retriangulate(factor[:p, p:])
+    stacked = factor[:p, p:]
+    return retriangulate(stacked)
 
 
 def _shea(explained: np.ndarray, total: np.ndarray) -> np.ndarray:
@@ -293,4 +316,6 @@ def _shea(explained: np.ndarray, total: np.ndarray) -> np.ndarray:
 def _rss(matrix: np.ndarray, target: np.ndarray) -> float:
     """Return the residual sum of squares of the regression of target on the columns."""
     size = matrix.shape[1]
-    return float(np.sum(retriangulate(np.column_stack([matrix, target]))[size:, size] ** 2))
+    stacked = np.column_stack([matrix, target])
+    triangle = retriangulate(stacked)
+    return float(np.sum(triangle[size:, size] ** 2))

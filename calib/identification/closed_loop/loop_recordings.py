@@ -99,26 +99,33 @@ def close_loops(
     # the longest part of each recording tells
     for part in ordered:
         if part.name not in shifts and loop.timing != "stated":
-            shifts[part.name], note = _shift(part, loop, partial(_fed_forward, controller, loop, cad, model))
+            feed_forward_of = partial(_fed_forward, controller, loop, cad, model)
+            shifts[part.name], note = _shift(part, loop, feed_forward_of)
             notes += note
     design = None
     if loop.design:
         design = loop.per_joint("design", model.n)
     pairs = []
     for part in stretches:
-        reference, every = _make_reference(part.motion, loop.rate, shifts.get(part.name, 0.0))
+        shift = shifts.get(part.name, 0.0)
+        reference, every = _make_reference(part.motion, loop.rate, shift)
         feed_forward = _fed_forward(controller, loop, cad, model, part.motion, reference, every)
         if loop.reference_velocity == "difference":
             # by half a period
             rates = np.diff(reference.q, axis=0) / reference.period
-            reference = replace(reference, v=np.vstack([reference.v[:1], rates]))
-        pairs.append((take(part, _inside(part.motion)), Loop(feed_forward, reference, every, design)))
+            v = np.vstack([reference.v[:1], rates])
+            reference = replace(reference, v=v)
+        inner = take(part, _inside(part.motion))
+        pairs.append((inner, Loop(feed_forward, reference, every, design)))
     return ClosedLoops(tuple(pairs), controller, identified, notes)
 
 
 def take(case: Case, part: slice) -> Case:
     """Return the part of a case in the slice `part`."""
-    return replace(case, motion=case.motion.part(part), target=case.target[part], present=case.present[part])
+    motion = case.motion.part(part)
+    target = case.target[part]
+    present = case.present[part]
+    return replace(case, motion=motion, target=target, present=present)
 
 
 def _check_reference(motion: Motion) -> None:
@@ -137,9 +144,11 @@ def _check_reference(motion: Motion) -> None:
             motion.file, f"the reference of {motion.joint_names[joint]} (joint {joint + 1}) is not finite everywhere"
         )
     for j in np.flatnonzero(np.ptp(motion.q, axis=0) > 1e-3):
-        _compare(motion, motion.q_ref[:, j], int(j))
+        reference = motion.q_ref[:, j]
+        _compare(motion, reference, int(j))
     if motion.located is None:
-        check_no_copy(motion, low_passed(np.asarray(motion.q_ref), motion))
+        reference_q = low_passed(np.asarray(motion.q_ref), motion)
+        check_no_copy(motion, reference_q)
 
 
 def _compare(motion: Motion, reference: np.ndarray, joint: int, max_difference: float = 0.3) -> None:
@@ -195,8 +204,10 @@ def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., LoopContro
             )
         return 0.0, ()
     reference, every = _make_reference(motion, loop.rate)
-    band = min(loop.band, 0.5 * float(motion.cutoff.min()), 0.2 * motion.rate)
-    shift = reference_shift(part, reference, every, fed_forward(motion, reference, every), band)
+    lowest_cutoff = float(motion.cutoff.min())
+    band = min(loop.band, 0.5 * lowest_cutoff, 0.2 * motion.rate)
+    controller = fed_forward(motion, reference, every)
+    shift = reference_shift(part, reference, every, controller, band)
     text = f"{1e3 * abs(shift.seconds):.3g} ± {1e3 * shift.sigma:.2g} ms"
     if estimated:
         begin = (motion.located or 0.0) + shift.seconds
@@ -210,13 +221,13 @@ def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., LoopContro
     min_shift, min_gain, max_left = 1.5e-3, 2.0, 0.5
     significant = abs(shift.seconds) > max(5.0 * shift.sigma, min_shift)
     if significant and shift.left < max_left and shift.before > min_gain * shift.left:
-        refuse_data(
-            motion.file,
+        message = (
             f"its reference (q_ref) is {'late' if shift.seconds < 0.0 else 'early'} by {text}: so "
             f"moved, the controller of [loop] explains {100 * (1 - shift.left):.3g} % of the torques, as logged "
             f"{100 * (1 - min(shift.before, 1.0)):.2g} %. Set [loop] timing = 'estimated' to move it; or correct kd "
-            "and share, which may look like this; timing = 'stated' takes it as it is",
+            "and share, which may look like this; timing = 'stated' takes it as it is"
         )
+        refuse_data(motion.file, message)
     return 0.0, ()
 
 
@@ -238,7 +249,8 @@ def _make_reference(
     cutoff = min(cutoff_factor * float(motion.cutoff.max()), USABLE * motion.rate / 2)
     smooth = low_pass(np.asarray(motion.q_ref), motion.rate, cutoff)
     spline = CubicSpline(np.arange(len(smooth)), smooth)
-    indices = np.arange(int((len(smooth) - 1) * every + 1e-9) + 1) / every
+    count = int((len(smooth) - 1) * every + 1e-9) + 1
+    indices = np.arange(count) / every
     times = np.clip(indices - shift * motion.rate, 0.0, len(smooth) - 1.0)
     q, v, a = (spline(times, order) * motion.rate**order for order in range(3))
     return Reference(motion.t[0] + indices / motion.rate, q, v, a), every
@@ -273,7 +285,8 @@ def _inside(motion: Motion, settling_time: float = 0.2) -> slice:
     `settling_time`: [s] our choice.
     """
     edge = max(border(motion.rate, float(motion.cutoff.min())), 4)
-    return slice(max(edge, int(np.ceil(settling_time * motion.rate))), len(motion) - edge)
+    settling_samples = int(np.ceil(settling_time * motion.rate))
+    return slice(max(edge, settling_samples), len(motion) - edge)
 
 
 def _controller(loop: LoopSettings, case: Case) -> tuple[LoopController, IdentifiedController | None, tuple[str, ...]]:
@@ -285,7 +298,8 @@ def _controller(loop: LoopSettings, case: Case) -> tuple[LoopController, Identif
     tau = motor_torques(case)
     if tau is None:
         raise UsageError(f"[loop] controller = 'identify' needs motor torques, not rows = '{case.torque_rows.name}'")
-    band = min(loop.band, float(motion.cutoff.min()), 0.4 * motion.rate)
+    lowest_cutoff = float(motion.cutoff.min())
+    band = min(loop.band, lowest_cutoff, 0.4 * motion.rate)
 
     def identified(shift: float) -> IdentifiedController:
         reference, _ = _make_reference(motion, loop.rate, shift)
@@ -341,10 +355,14 @@ def _fed_forward(
         if motion.tau_ff is None:
             refuse_data(motion.file, "[loop] feedforward: the recording has no column tau_ff")
         grid = np.arange(len(motion))
-        return controller.with_feedforward(CubicSpline(grid, motion.tau_ff)(np.arange(len(reference.t)) / every))
+        samples = np.arange(len(reference.t)) / every
+        torque = CubicSpline(grid, motion.tau_ff)(samples)
+        return controller.with_feedforward(torque)
     if cad is None:
         raise UsageError("[loop] feedforward = 'cad': the robot's description states no masses")
-    believed = plant_of(model, np.append(cad, np.zeros(model.p - len(cad))))
+    no_drives = np.zeros(model.p - len(cad))
+    values = np.append(cad, no_drives)
+    believed = plant_of(model, values)
     return controller.with_feedforward(believed.feed_forward(reference))
 
 
@@ -354,8 +372,10 @@ def simulated_case(case: Case, run: SimulatedRun, loop: Loop) -> Case:
     The same low-pass and differences: what they do to a motion (they round off reversals) is in W and in Z alike, and
     what tells W from Z is noise.
     """
-    q, v, a = followed(run.q, case.motion, simulated_samples(case, run.t, loop))
-    return replace(case, motion=replace(case.motion, q=q, v=v, a=a))
+    samples = simulated_samples(case, run.t, loop)
+    q, v, a = followed(run.q, case.motion, samples)
+    motion = replace(case.motion, q=q, v=v, a=a)
+    return replace(case, motion=motion)
 
 
 def followed(q: np.ndarray, motion: Motion, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -367,7 +387,9 @@ def followed(q: np.ndarray, motion: Motion, index: np.ndarray) -> tuple[np.ndarr
     """
     positions = low_passed(q, motion, motion.cutoff)
     less = low_passed(q, motion, motion.velocity_cutoff)
-    return positions[index], slope(less, motion.rate)[index], curvature(positions, motion.rate)[index]
+    velocity = slope(less, motion.rate)[index]
+    acceleration = curvature(positions, motion.rate)[index]
+    return positions[index], velocity, acceleration
 
 
 def simulated_samples(case: Case, t: np.ndarray, loop: Loop) -> np.ndarray:

@@ -37,11 +37,9 @@ class LoopEstimate(MethodEstimate):
         identification = self.instrumental
         if identification is None:
             return super().testable()
-        return (
-            identification.problem.testable(identification.fit, identification.std),
-            np.ones(1),
-            np.array([identification.inflation]),
-        )
+        residuals = identification.problem.testable(identification.fit, identification.std)
+        inflation = np.array([identification.inflation])
+        return residuals, np.ones(1), inflation
 
 
 def attempted_in_loop(
@@ -81,7 +79,8 @@ class _Simulated(Method):
             return replace(plain, method=self.name)
         richer = [term for term in problem.terms[problem.base.b :] if term is not None]
         estimate = self.beside(problem, plain, richer)
-        return replace(estimate, seconds=plain.seconds + estimate.seconds)
+        seconds = plain.seconds + estimate.seconds
+        return replace(estimate, seconds=seconds)
 
     def beside(
         self, problem: IdentificationProblem, plain: MethodEstimate, terms: Sequence[DriveTerm] = ()
@@ -101,12 +100,13 @@ class _Simulated(Method):
             constraints = constraints_of(problem)
 
         def estimate() -> LoopEstimate:
+            method = self.instruments or loop.instruments
             identification = identify_instrumental(
                 model,
                 problem.base,
                 loops.pairs,
                 problem.decimator,
-                method=self.instruments or loop.instruments,
+                method=method,
                 inertia=inertia,
                 positive=loop.positive,
                 terms=terms,
@@ -115,12 +115,13 @@ class _Simulated(Method):
             simulations = 0
             for iteration in identification.rounds:
                 simulations += len(loops.pairs) * (1 + iteration.retreats)
+            iterations = len(identification.rounds)
             result = replace(
                 plain,
                 method=self.name,
                 solution=identification.fit,
                 std=identification.std,
-                iterations=len(identification.rounds),
+                iterations=iterations,
                 simulations=simulations,
                 beforehand=None,
                 held=identification.constrained,
@@ -187,7 +188,8 @@ class LoopTest:
         """Return the findings for a user of this estimate, or (`taken` False) of a least-squares one."""
         if self.found is None or self.loops is None:
             return [finding("loop-test-failed", why=self.failure)]
-        noticed = [*_weakness(self.found), *(_distance(self.found) or _gains(self.found) or _torques(self.found))]
+        causes = _distance(self.found) or _gains(self.found) or _torques(self.found)
+        noticed = [*_weakness(self.found), *causes]
         return noticed + (_blurred(self.found, self.loops) if is_estimate else _biased(self.found))
 
 
@@ -203,7 +205,8 @@ def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) 
         try:
             loop_estimate = IV.beside(problem, estimate)
         except CalibError as error:
-            return LoopTest(failure=str(error))
+            failure = str(error)
+            return LoopTest(failure=failure)
     return LoopTest(
         loop_estimate.instrumental, loop_estimate.loops, "" if loop_estimate.found else str(loop_estimate.failure)
     )
@@ -271,7 +274,10 @@ def _blurred(identification: Instrumental, loops: ClosedLoops) -> list[Finding]:
     noise = sign_noise(identification.plant, loops.pairs[0][0].motion)
     max_blur = 3.0
     signs = [term for term in identification.plant.terms if term.shape == "sign"]
-    blurred = {sign.name: noise[sign.acts[0][0]] / sign.settings[-1] for sign in signs}
+    blurred = {}
+    for sign in signs:
+        joint = sign.acts[0][0]
+        blurred[sign.name] = noise[joint] / sign.settings[-1]
     joints = [f"{size:.2g} at {name}" for name, size in blurred.items() if size > max_blur]
     if joints:
         return [finding("noisy-signs", joints=joints)]
@@ -319,15 +325,10 @@ def disagreement(problem: IdentificationProblem, estimate: MethodEstimate, test:
     if away[worst] < SIGMAS or not np.any(own_errors > limit * beside):
         return None
     factors = _factors(problem, own_estimate.values, iv_estimate.values)
-    return LoopDisagreement(
-        estimate.method,
-        name,
-        iv_estimate.names[worst],
-        float(away[worst]),
-        tuple(own_errors.tolist()),
-        tuple(beside.tolist()),
-        factors,
-    )
+    parameter = iv_estimate.names[worst]
+    sigmas = float(away[worst])
+    beside_left = tuple(beside.tolist())
+    return LoopDisagreement(estimate.method, name, parameter, sigmas, tuple(own_errors.tolist()), beside_left, factors)
 
 
 def _factors(problem: IdentificationProblem, estimate: np.ndarray, reference: np.ndarray) -> tuple[float, ...]:
@@ -369,24 +370,28 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
             f"with the instruments of unbound parameters alone (Janot's slides) the estimate is at most "
             f"{distance.max():.2g} σ away, at {identification.names[int(np.argmax(distance))]}",
         )
+    rounds = len(identification.rounds)
+    largest_shift_sigma = float(identification.shift.max())
+    least_partial_r2 = float(strength.partial_r2.min())
+    controller_explains_percent = identified and identified.explained
     return LoopMetrics(
         "",
         notes,
         identification.estimator.name,
         beside,
-        len(identification.rounds),
+        rounds,
         identification.verdict,
-        float(identification.shift.max()),
+        largest_shift_sigma,
         strength.cragg_donald,
         strength.weak,
-        float(strength.partial_r2.min()),
+        least_partial_r2,
         identification.distance,
         identification.direct,
         identification.stray,
         identification.valid,
         identification.explains,
         loops.controller,
-        identified and identified.explained,
+        controller_explains_percent,
     )
 
 
@@ -396,4 +401,5 @@ def _table(identification: Instrumental) -> tuple[tuple[object, ...], ...]:
     ordinary = identification.ordinary.estimate.values
     explained = 100.0 * identification.strength.partial_r2
     columns = (estimate.values, estimate.sigma, ordinary, identification.shift, explained)
-    return tuple(zip(estimate.names, estimate.units, *[column.tolist() for column in columns]))
+    columns_of_numbers = [column.tolist() for column in columns]
+    return tuple(zip(estimate.names, estimate.units, *columns_of_numbers))

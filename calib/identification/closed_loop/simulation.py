@@ -84,7 +84,8 @@ class Plant:
     def carrying(self, carried: Collection[str]) -> Plant:
         """Return the robot model with these payloads alone."""
         carried_columns = IdentificationModel(self.bodies).carried_columns(carried)
-        return self.with_parameters(self.parameters * np.append(carried_columns, np.ones(len(self.terms))))
+        factors = np.append(carried_columns, np.ones(len(self.terms)))
+        return self.with_parameters(self.parameters * factors)
 
     def run(self, controller: LoopController, reference: Reference, sensing: Sensing | None = None) -> SimulatedRun:
         """Return the simulated motion of the robot that follows a reference; see `simulate`."""
@@ -182,7 +183,8 @@ def simulate(
         sigma = np.broadcast_to(getattr(sensing, name), (n,))
         drawn[name] = _draw(rng, sigma, count)
     if sensing.q_band is not None:
-        drawn["sigma_q"] = _coloured(drawn["sigma_q"], 2.0 * np.pi * sensing.q_band * reference.period)
+        step = 2.0 * np.pi * sensing.q_band * reference.period
+        drawn["sigma_q"] = _coloured(drawn["sigma_q"], step)
     if sensing.push_band is not None:
         drawn["push"] = _coloured(drawn["push"], 2.0 * np.pi * sensing.push_band * reference.period)
     if push is not None:
@@ -228,7 +230,8 @@ def simulate(
     else:
         t = reference.t[0] + tick * reference.period
     q, v, a, measured, torque = [frozen(series) for series in out]
-    return SimulatedRun(t, q, v, a, measured, frozen(out[4] + heard), torque)
+    tau = frozen(out[4] + heard)
+    return SimulatedRun(t, q, v, a, measured, tau, torque)
 
 
 def sample_ticks(count: int, every: float) -> np.ndarray:
@@ -262,7 +265,8 @@ def forward_dynamics(
     else:
         values = shaped(parameters, (len(q), count), "parameters")
     layout = layout_of(plant)
-    failed = loop_kernels.forward_dynamics(*packed(plant), *layout, np.ascontiguousarray(values), q, v, tau, out)
+    contiguous = np.ascontiguousarray(values)
+    failed = loop_kernels.forward_dynamics(*packed(plant), *layout, contiguous, q, v, tau, out)
     require(failed < 0, f"sample {failed}: the inertia matrix is not positive definite", CannotSimulate)
     return out
 
@@ -279,15 +283,18 @@ def _coloured(white: np.ndarray, step: float) -> np.ndarray:
     if not len(white):
         return white
     pole = float(np.exp(-step))
-    bands = np.array([[1.0], [-pole]]) * np.ones(len(white))
-    return np.ascontiguousarray(solve_banded((1, 0), bands, np.sqrt(1.0 - pole**2) * white))
+    filter_bands = np.array([[1.0], [-pole]])
+    bands = filter_bands * np.ones(len(white))
+    scaled_noise = np.sqrt(1.0 - pole**2) * white
+    return np.ascontiguousarray(solve_banded((1, 0), bands, scaled_noise))
 
 
 def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return the index arrays by which `loop_kernels.set_parameters` writes parameters into the output of `packed`."""
     n = plant.bodies.n
     first = plant.inertial
-    order = np.ascontiguousarray(np.broadcast_to(plant.bodies.order, (plant.bodies.count, 10)), dtype=np.int64)
+    orders = np.broadcast_to(plant.bodies.order, (plant.bodies.count, 10))
+    order = np.ascontiguousarray(orders, dtype=np.int64)
     entries: list[tuple[int, int, int]] = []
     shares: list[float] = []
     owners: list[int] = []
@@ -318,7 +325,8 @@ def packed(plant: Plant) -> Packed:
     for row, code, amount, settings, weights in acts:
         kinds.append([row, code])
         values.append([amount, *settings, *weights])
-    body = body_rows(plant.bodies, plant.parameters[: 10 * bodies])
+    parameters = plant.parameters[: 10 * bodies]
+    body = body_rows(plant.bodies, parameters)
     kind_rows = np.array(kinds, dtype=np.int64).reshape(-1, 2)
     value_rows = np.array(values).reshape(-1, 8 + n)
     return np.ascontiguousarray(links), body, linear, kind_rows, value_rows
@@ -334,9 +342,11 @@ def body_rows(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
             before = np.eye(3)
         else:
             before = turns[parent].T
-        result[i, :9] = (before @ bodies.placements[i, :3, :3] @ turns[i]).ravel()
+        rotation = before @ bodies.placements[i, :3, :3] @ turns[i]
+        result[i, :9] = rotation.ravel()
         result[i, 9:12] = before @ bodies.placements[i, :3, 3]
-        result[i, 12:22] = parameters[10 * i : 10 * i + 10][bodies.order[i]]
+        standard = parameters[10 * i : 10 * i + 10]
+        result[i, 12:22] = standard[bodies.order[i]]
     result[:-1, 22] = bodies.scales
     return result
 
@@ -364,7 +374,8 @@ def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int, ramp: float 
                 else:
                     settings = [*term.settings]
                 code = getattr(shape_kernels, term.shape.upper())
-                acts.append((row, code, value, [*settings, *[0.0] * (7 - len(settings))], weights))
+                padding = [0.0] * (7 - len(settings))
+                acts.append((row, code, value, [*settings, *padding], weights))
             else:
                 first = 0 if term.shape == "acceleration" else n
                 linear[row, first : first + n] += value * weights

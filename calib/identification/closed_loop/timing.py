@@ -58,7 +58,8 @@ def reference_shift(
         NotConverged: where no shift within `MAX_SHIFT` explains the torques best.
     """
     law = _Law(case, reference, every, controller, band)
-    shift = _by_positions(law.asked, law.measured, law.t[law.rows])
+    t = law.t[law.rows]
+    shift = _by_positions(law.asked, law.measured, t)
     max_steps = 30
     steps = 0
     while True:
@@ -78,7 +79,8 @@ def reference_shift(
     sigma = float(np.sqrt(tau / max(information, 1e-300)))
     torque = law.torque(law.t, 0)[law.rows]
     rise = law.torque(law.t, 1)[law.rows]
-    effect = float(sigma * np.sqrt(np.mean(rise.var(axis=0) / np.maximum(torque.var(axis=0), 1e-300))))
+    variance_ratio = rise.var(axis=0) / np.maximum(torque.var(axis=0), 1e-300)
+    effect = float(sigma * np.sqrt(np.mean(variance_ratio)))
     return ReferenceShift(shift, sigma, *law.left(shift), effect)
 
 
@@ -91,7 +93,9 @@ class _Law:
         self.controller = controller
         self.t = np.arange(len(case.motion)) / rate
         ticks = np.arange(len(self.t)) * every
-        parts = (reference.at(ticks)[0], case.motion.q, cast(np.ndarray, motor_torques(case)))
+        asked_q, *_ = reference.at(ticks)
+        torques = cast(np.ndarray, motor_torques(case))
+        parts = (asked_q, case.motion.q, torques)
         self.asked, self.measured, self.torque = (CubicSpline(self.t, low_pass(x, rate, band)) for x in parts)
         self.ahead = np.zeros((len(self.t), n))
         if controller.ahead is not None:
@@ -121,7 +125,8 @@ class _Law:
         a_ref = self.asked(shifted, 2)
         error = q_ref - self.measured(instants)
         speed = controller.share * v_ref - self.measured(self.t - self.speed_late, 1)
-        sums = np.cumsum(error, axis=0) * (self.t[1] - self.t[0])
+        step = self.t[1] - self.t[0]
+        sums = np.cumsum(error, axis=0) * step
         law = controller.kp * error + controller.kd * speed + controller.ki * sums + self.ahead
         slopes = -(controller.kp * v_ref + controller.kd * controller.share * a_ref + controller.ki * q_ref)
         residual = (self.torque(self.t) - law)[self.rows]
@@ -142,10 +147,12 @@ class _Law:
         reference = np.array(derivatives)
         scale = np.maximum(reference.std(axis=1, keepdims=True), 1e-300)
         reference = (reference - reference.mean(axis=1, keepdims=True)) / scale
-        along = np.linalg.qr(reference.transpose(2, 1, 0))[0].transpose(0, 2, 1)
+        orthonormal, _ = np.linalg.qr(reference.transpose(2, 1, 0))
+        along = orthonormal.transpose(0, 2, 1)
 
         def projected(torques: np.ndarray) -> np.ndarray:
-            return np.sum((along @ torques.T[:, :, None]) ** 2, axis=(1, 2))
+            along_reference = along @ torques.T[:, :, None]
+            return np.sum(along_reference**2, axis=(1, 2))
 
         size = np.maximum(projected(self.torque(times)), 1e-300)
         residual_shifted, _ = self.linearised(shift)
@@ -164,7 +171,9 @@ def _by_positions(reference: CubicSpline, measured: CubicSpline, t: np.ndarray) 
         residual = measured(t) - reference(np.clip(t - shift, low, high))
         slopes = -reference(np.clip(t - shift, low, high), 1)
         size = np.maximum(measured(t).var(axis=0), 1e-300)
-        step = float(np.sum(residual * slopes / size) / max(np.sum(slopes**2 / size), 1e-300))
+        gradient = np.sum(residual * slopes / size)
+        curvature = max(np.sum(slopes**2 / size), 1e-300)
+        step = float(gradient / curvature)
         shift = float(np.clip(shift + step, -MAX_SHIFT, MAX_SHIFT))
         if abs(step) < 1e-9:
             break
@@ -202,12 +211,17 @@ def check_no_copy(motion: Motion, reference_q: np.ndarray) -> None:
     measured = CubicSpline(t, motion.q[:, moves])
     reference = CubicSpline(t, reference_q[:, moves])
     shift = _by_positions(reference, measured, rows)
-    residual = measured(rows) - reference(np.clip(rows - shift, t[0], t[-1]))
+    shifted = np.clip(rows - shift, t[0], t[-1])
+    residual = measured(rows) - reference(shifted)
     # of the positions' noise in the band; no commanded motion has that of the encoders
     share = 0.01
-    noise = (motion.cutoffs.noise * np.sqrt(2.0 * motion.cutoff / motion.rate))[moves]
-    exact = np.sqrt(np.mean(residual**2, axis=0)) < np.maximum(share * noise, 1e-7 * measured(rows).std(axis=0))
-    shares = _noise_shares(motion, measured(rows), residual, np.flatnonzero(moves))
+    all_noise = motion.cutoffs.noise * np.sqrt(2.0 * motion.cutoff / motion.rate)
+    noise = all_noise[moves]
+    rms = np.sqrt(np.mean(residual**2, axis=0))
+    rounding = 1e-7 * measured(rows).std(axis=0)
+    exact = rms < np.maximum(share * noise, rounding)
+    joints = np.flatnonzero(moves)
+    shares = _noise_shares(motion, measured(rows), residual, joints)
     # of the noise's power in the distance from a copy; from a commanded motion it is all (our choice)
     max_share = 0.1
     if exact.all() or (len(shares) and np.median(shares) < max_share):
@@ -237,8 +251,10 @@ def _noise_shares(motion: Motion, measured: np.ndarray, residual: np.ndarray, jo
     above, min_bins = 4.0, 8
     result = []
     for column, joint in enumerate(joints):
-        quiet = (power[:, column] < above * floor[column]) & (f > 0.0) & (f < 0.8 * motion.cutoff[joint])
+        in_band = (f > 0.0) & (f < 0.8 * motion.cutoff[joint])
+        quiet = (power[:, column] < above * floor[column]) & in_band
         octave = quiet & (f <= 2.0 * f[np.argmax(quiet)])
         if octave.sum() >= min_bins:
-            result.append(spectrum[octave, column].sum() / power[octave, column].sum())
+            share = spectrum[octave, column].sum() / power[octave, column].sum()
+            result.append(share)
     return np.array(result)

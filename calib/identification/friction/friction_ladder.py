@@ -179,7 +179,8 @@ def select_friction(
 
     say("friction: standard")
     error = bench.errors([])
-    steps = [bench.trial("standard", [], error, tuple(range(candidates.n)))]
+    joints = tuple(range(candidates.n))
+    steps = [bench.trial("standard", [], error, joints)]
     selected: list[int] = []
     waiting = list(offered)
     for second_round in (False, True):
@@ -271,7 +272,9 @@ class _Bench:
             improved = []
             for joint_set in at:
                 rows = self._rows(joint_set, side)
-                pays = _pays(self._whitened(error, rows), self._whitened(new_error, rows))
+                before = self._whitened(error, rows)
+                after = self._whitened(new_error, rows)
+                pays = _pays(before, after)
                 carries = pays and _carries(self._whitened(halves_error, rows), self._whitened(new_halves_error, rows))
                 if carries and _extrapolates(
                     self._whitened(ranges_error, rows), self._whitened(new_ranges_error, rows)
@@ -296,7 +299,8 @@ class _Bench:
 
     def _whitened(self, squares: np.ndarray, rows: list[int]) -> np.ndarray:
         """Return the squared errors (k,) of some rows together, each in units of its residuals."""
-        return np.sum(squares[:, rows] / self.validation.std[rows] ** 2, axis=1)
+        relative = squares[:, rows] / self.validation.std[rows] ** 2
+        return np.sum(relative, axis=1)
 
     def trial(
         self,
@@ -310,17 +314,20 @@ class _Bench:
         """Return the result of a step from its columns, its squared errors, and the joints at which it is kept."""
         blocks = self.validation.blocks
         rows = self.validation.rows
-        squares = (self.validation.data.factors[:, :, -1] ** 2).sum(axis=1).reshape(-1, rows)
+        target_squares = (self.validation.data.factors[:, :, -1] ** 2).sum(axis=1)
+        squares = target_squares.reshape(-1, rows)
         # Σ τ² per row over the blocks that are held out.
         size = squares[:blocks].sum(axis=0)
         with np.errstate(divide="ignore", invalid="ignore"):
             percent = 100.0 * np.sqrt(error.sum(axis=0) / size)
         same_unit = np.setdiff1d(np.arange(len(size)), self.candidates.apart)
-        total = 100.0 * np.sqrt(error[:, same_unit].sum() / size[same_unit].sum())
+        share = error[:, same_unit].sum() / size[same_unit].sum()
+        total = 100.0 * np.sqrt(share)
         joints_percent = tuple(np.nan_to_num(percent).tolist())
         kept_at_joints = tuple(1 + joint for joint in at)
         parameters = len(self._with_base(columns))
-        return FrictionTrial(name, parameters, float(total), joints_percent, kept_at_joints, note, terms)
+        cross_validated_percent = float(total)
+        return FrictionTrial(name, parameters, cross_validated_percent, joints_percent, kept_at_joints, note, terms)
 
 
 def _joints(term: DriveTerm) -> tuple[int, ...]:
@@ -362,15 +369,20 @@ def _terms(candidates: FrictionCandidates, names: Sequence[str]) -> dict[str, li
     if "coupling" in terms:
         terms["coupling"] = _couplings(candidates)
     for joint in range(candidates.n):
-        speed = np.concatenate([np.abs(case.motion.v[:, joint]) for case in candidates.cases])
+        speeds = [np.abs(case.motion.v[:, joint]) for case in candidates.cases]
+        speed = np.concatenate(speeds)
         position = np.concatenate([case.motion.q[:, joint] for case in candidates.cases])
         v0 = float(candidates.v0[joint])
-        joint_range = RecordedRange(v0, float(np.quantile(speed, 0.98)), float(speed.max()), float(np.ptp(position)))
+        edge = float(np.quantile(speed, 0.98))
+        fastest = float(speed.max())
+        travel = float(np.ptp(position))
+        joint_range = RecordedRange(v0, edge, fastest, travel)
         if joint_range.peak <= 0.0:
             continue
         for name in names:
             if name in STEPS:
-                terms[name] += drives.offered(name, joint, joint_range, bool(candidates.linear[joint]))
+                linear = bool(candidates.linear[joint])
+                terms[name] += drives.offered(name, joint, joint_range, linear)
     return terms
 
 
@@ -383,7 +395,8 @@ def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
     if not candidates.torque_rows.motors_alone:
         return []
     matrix, target, weight, motion = _sampled(candidates)
-    whitened = (matrix / candidates.std[:, None]).reshape(-1, matrix.shape[2])
+    weighed = matrix / candidates.std[:, None]
+    whitened = weighed.reshape(-1, matrix.shape[2])
     basis = np.asarray(scipy.linalg.qr(whitened, mode="economic")[0])
     torque = (target / candidates.std).ravel()
     residual = torque - basis @ (basis.T @ torque)
@@ -395,9 +408,11 @@ def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
         for ratio in (1.0, -1.0):
             terms = drives.coupled(i, j, float(candidates.v0[j]), f"{i + 1}.{j + 1}", ratio)
             columns = np.zeros((len(terms), n, len(target)))
-            drives.fill(terms, columns, [*motion, None], np.zeros((0, len(target))))
+            no_values = np.zeros((0, len(target)))
+            drives.fill(terms, columns, [*motion, None], no_values)
             row_weight = (weight / candidates.std)[:, :, None]
-            white = (columns.transpose(2, 1, 0) * row_weight).reshape(-1, len(terms))
+            weighed = columns.transpose(2, 1, 0) * row_weight
+            white = weighed.reshape(-1, len(terms))
             white -= basis @ (basis.T @ white)
             values = np.linalg.lstsq(white, residual, rcond=None)[0]
             remainder = residual - white @ values
@@ -410,7 +425,9 @@ def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
     coupled_joints: set[int] = set()
     for _, terms in sorted(explaining, key=lambda entry: -entry[0]):
         if coupled_joints.isdisjoint(_joints(terms[0])):
-            selected += [replace(term, linear=bool(candidates.linear[_joints(term)[0]])) for term in terms]
+            for term in terms:
+                joint = _joints(term)[0]
+                selected.append(replace(term, linear=bool(candidates.linear[joint])))
             for term in terms:
                 coupled_joints.update(_joints(term))
     return selected
@@ -469,6 +486,7 @@ def _cross_validation(
     if candidates.prior is not None:
         prior_rows = np.sqrt(TEMPERING) * candidates.prior.widened(len(all_terms))
     blocks = 1 + max(int(part.block.max(initial=-1)) for part in rows)
+    case_regimes = regimes(rows, candidates.cases, decimator)
     validation = CrossValidation(
         data,
         rows=rows[0].target.shape[1],
@@ -477,6 +495,6 @@ def _cross_validation(
         inflation=candidates.inflation,
         group=np.array(groups),
         prior=prior_rows,
-        regimes=regimes(rows, candidates.cases, decimator),
+        regimes=case_regimes,
     )
     return validation, columns_of

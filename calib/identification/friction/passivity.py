@@ -35,7 +35,8 @@ def _dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
     for case in cases:
         v = case.motion.v
         load = dynamics.transmitted(case) if needs_load else None
-        total += np.abs(v * case.target[:, -n:]).sum(axis=0)
+        measured = case.target[:, -n:]
+        total += np.abs(v * measured).sum(axis=0)
         moves |= moving(case.motion).any(axis=0)
         for term, value in terms:
             for row, column in term_columns(term, case, load):
@@ -64,7 +65,8 @@ def braking(terms: Sequence[DriveTerm | None], fastest: np.ndarray) -> np.ndarra
         if term.nonnegative:
             rows.append(unit_rows[column])
         if term.joint is not None and term.form.dissipative and not term.form.remembers:
-            groups.setdefault((term.joint, term.side, term.form.loaded), []).append(column)
+            key = (term.joint, term.side, term.form.loaded)
+            groups.setdefault(key, []).append(column)
     for (joint, _, _), columns in groups.items():
         group_terms = [(column, term) for column, term in enumerate(terms) if column in columns and term is not None]
         if all(term.nonnegative for _, term in group_terms):
@@ -72,7 +74,9 @@ def braking(terms: Sequence[DriveTerm | None], fastest: np.ndarray) -> np.ndarra
             continue
         speeds = fastest[joint] * np.append(np.geomspace(0.02, 1.0, SPEEDS_PER_DIRECTION), 10.0)
         v = np.concatenate([-speeds, speeds])
-        motion = TermMotion(np.zeros_like(v), v, np.zeros_like(v), np.ones_like(v), None)
+        zero = np.zeros_like(v)
+        one_sign = np.ones_like(v)
+        motion = TermMotion(zero, v, zero, one_sign, None)
         power = np.zeros((len(v), p))
         for column, term in group_terms:
             power[:, column] = term.values(motion) * np.sign(v)

@@ -109,7 +109,8 @@ class Ripple:
     def found(self) -> RippleWaves:
         """Record of the waves and of the share of the residual that they explain."""
         waves = tuple(GearWave(gear + 1, order) for gear, order in self.waves)
-        return RippleWaves(self.joint + 1, waves, self.share)
+        joint = self.joint + 1
+        return RippleWaves(joint, waves, self.share)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,13 +171,15 @@ def find_turns(track: GearTravel, residuals: np.ndarray) -> dict[int, int]:
     scores: dict[int, np.ndarray] = {}
     total = np.zeros(len(TURNS))
     for joint in track.moving:
-        score = _lobes(coherence(track, joint, residuals[:, joint]))
+        power = coherence(track, joint, residuals[:, joint])
+        score = _lobes(power)
         scores[joint] = score
         total = total + score / max(float(score.max()), 1e-300)
 
     # A gear takes the number of turns that is most coherent in all gears together, unless its own says otherwise.
     best = {joint: int(np.argmax(score)) for joint, score in scores.items()}
-    candidates = sorted({*best.values(), int(np.argmax(total))}, key=lambda index: -float(total[index]))
+    tried = {*best.values(), int(np.argmax(total))}
+    candidates = sorted(tried, key=lambda index: -float(total[index]))
     turns = {}
     for joint, score in scores.items():
         index = best[joint]
@@ -202,7 +205,11 @@ def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int
     validation = _WaveCrossValidation(track, residual)
 
     # Families of the joint's own gear, and of the one other gear that is felt most.
-    power = {gear: _lobes(coherence(track, gear, residual))[turns[gear] - TURNS[0]] for gear in turns if gear != joint}
+    power = {}
+    for gear in turns:
+        if gear != joint:
+            lobes = _lobes(coherence(track, gear, residual))
+            power[gear] = lobes[turns[gear] - TURNS[0]]
     gears = [joint]
     if power:
         gears.append(max(power, key=power.__getitem__))
@@ -221,7 +228,8 @@ def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int
     if fine_share > best:
         nodes, best, ridge = FINE, fine_share, fine_ridge
     _, values = validation.fit(waves, nodes, ridge)
-    return Ripple(joint, waves, _terms(joint, waves, nodes, track), frozen(values), best)
+    terms = _terms(joint, waves, nodes, track)
+    return Ripple(joint, waves, terms, frozen(values), best)
 
 
 def _family(turns: int) -> tuple[tuple[int, ...], ...]:
@@ -287,8 +295,11 @@ class _WaveCrossValidation:
         if unit == 0.0:
             return 0.0, RIDGES[-1]
         # Estimates (ridges, blocks, k) without each block; what they leave of its power in comparison to zero.
-        ridges = (np.array(RIDGES) * unit)[:, None, None, None] * np.eye(len(square))
-        values = np.linalg.solve((square - squares) + ridges, (cross - crosses)[..., None])[..., 0]
+        sizes = (np.array(RIDGES) * unit)[:, None, None, None]
+        ridges = sizes * np.eye(len(square))
+        right = (cross - crosses)[..., None]
+        left_out = square - squares
+        values = np.linalg.solve(left_out + ridges, right)[..., 0]
         linear = 2.0 * np.einsum("rfk,fk->r", values, crosses)
         quadratic = np.einsum("rfk,fkl,rfl->r", values, squares, values, optimize=True)
         share = (linear - quadratic) / float(residual @ residual)
@@ -300,7 +311,9 @@ class _WaveCrossValidation:
         matrix = self.columns(waves, nodes)
         square = matrix.T @ matrix
         unit = float(np.trace(square)) / len(square)
-        values = np.linalg.solve(square + ridge * unit * np.eye(len(square)), matrix.T @ self.residual)
+        ridge_matrix = ridge * unit * np.eye(len(square))
+        right = matrix.T @ self.residual
+        values = np.linalg.solve(square + ridge_matrix, right)
         return self.residual - matrix @ values, values
 
 
@@ -310,7 +323,8 @@ def _columns(track: GearTravel, wave: Wave, nodes: Sequence[float]) -> np.ndarra
     q = track.q[:, gear]
     v = track.v[:, gear]
     motion = TermMotion(q, v, np.zeros_like(q))
-    return np.stack([term.values(motion) for term in _terms(gear, (wave,), nodes, None)], axis=1)
+    wave_terms = [term.values(motion) for term in _terms(gear, (wave,), nodes, None)]
+    return np.stack(wave_terms, axis=1)
 
 
 def coherence(track: GearTravel, gear: int, residual: np.ndarray) -> np.ndarray:
@@ -321,7 +335,8 @@ def coherence(track: GearTravel, gear: int, residual: np.ndarray) -> np.ndarray:
     edges = np.quantile(speed, np.linspace(0.1, 1.0, SPEED_BINS + 1))[:-1]
     direction = np.where(v > 0.0, 1, -1)
     speed_bin = np.searchsorted(edges, speed, side="right") * direction
-    cell = np.floor(q / (2.0 * np.pi) * CELLS).astype(int) % CELLS
+    turns = q / (2.0 * np.pi) * CELLS
+    cell = np.floor(turns).astype(int) % CELLS
     numbers, block = np.unique(track.block, return_inverse=True)
     result = np.zeros(CELLS // 2 + 1)
     # Bin 0 holds the slowest tenth, which is left out.
@@ -393,7 +408,9 @@ def _fast(case: Case, residual: np.ndarray) -> np.ndarray:
     """Return the high-pass part of a residual (N,), above twice the bandwidth of the motion, by segments."""
     motion = case.motion
     cutoff = min(2.0 * motion.cutoffs.dynamics, 0.4 * motion.rate)
-    slow = [low_pass(residual[start:stop], motion.rate, cutoff) for start, stop in segments(motion.segment)]
+    slow = []
+    for start, stop in segments(motion.segment):
+        slow.append(low_pass(residual[start:stop], motion.rate, cutoff))
     return residual - np.concatenate(slow)
 
 

@@ -73,7 +73,9 @@ class BodyCone(Frozen):
         # of a body in those units: keeps finite what the data do not tell
         max_trace = 1e4
         rows = [-np.einsum("irrj->ij", bodies) / max_trace]
-        terms = np.eye(columns.shape[1])[10 * count : 10 * count + len(self.positive)]
+        first = 10 * count
+        unit_rows = np.eye(columns.shape[1])
+        terms = unit_rows[first : first + len(self.positive)]
         rows.append(terms[self.positive])
         low = np.isfinite(lower)
         high = np.isfinite(upper)
@@ -81,9 +83,11 @@ class BodyCone(Frozen):
         lengths = np.linalg.norm(sides, axis=1, keepdims=True)
         edges = np.concatenate([lower[low], -upper[high]]) / lengths[:, 0]
         sides = sides / lengths
-        limits = np.repeat([1.0, 0.0], [count, int(self.positive.sum())])
+        positive_count = int(self.positive.sum())
+        limits = np.repeat([1.0, 0.0], [count, positive_count])
         offset = np.concatenate([limits, -edges])
-        solution = minimise(R @ columns, z, np.vstack([*rows, sides @ columns]), offset, bodies)
+        conditions = np.vstack([*rows, sides @ columns])
+        solution = minimise(R @ columns, z, conditions, offset, bodies)
         b = columns @ solution.values
         # the gradient's part that the cone balances
         forces = solution.rows[len(offset) - len(edges) :]
@@ -99,7 +103,8 @@ class BodyCone(Frozen):
         max_on_border = 1e-4
         border = eigenvalues[:, 0] < max_on_border * np.maximum(eigenvalues[:, -1], max_on_border)
         labels = tuple(label for label, touches in zip(self.labels, border) if touches)
-        return _Plane(normal * unit / size, float(normal @ b), labels)
+        bound = float(normal @ b)
+        return _Plane(normal * unit / size, bound, labels)
 
 
 def cone_of(model: RegressorModel, base: Base) -> BodyCone:

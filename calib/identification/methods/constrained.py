@@ -39,9 +39,11 @@ class Definite:
         """Return the smallest eigenvalues minus `least` (K,), and their derivatives (K, p) with respect to b (p,)."""
         size, n, _, p = self.matrices.shape
         flat = self.matrices.reshape(size, n * n, p)
-        values, vectors = np.linalg.eigh((flat @ b).reshape(size, n, n))
+        combined = flat @ b
+        values, vectors = np.linalg.eigh(combined.reshape(size, n, n))
         pairs = vectors[:, :, None, 0] * vectors[:, None, :, 0]
-        return values[:, 0] - self.least, np.asarray((pairs.reshape(size, 1, n * n) @ flat)[:, 0])
+        products = pairs.reshape(size, 1, n * n) @ flat
+        return values[:, 0] - self.least, np.asarray(products[:, 0])
 
     def satisfied(self, sizes: np.ndarray) -> bool:
         """Return whether the smallest eigenvalues minus `least` (K,) satisfy the constraint."""
@@ -73,7 +75,8 @@ def contradicting(matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> t
     if program.fun <= 1e-9 * max(1.0, float(np.abs(limit / size).max(initial=0.0))):
         return ()
     places = np.concatenate([np.flatnonzero(low), np.flatnonzero(high)])
-    return tuple(sorted({int(places[k]) for k in np.flatnonzero(program.ineqlin.marginals < -1e-9)}))
+    binding = np.flatnonzero(program.ineqlin.marginals < -1e-9)
+    return tuple(sorted({int(places[k]) for k in binding}))
 
 
 def restricted(covariance: np.ndarray, factor: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -95,7 +98,8 @@ def restricted(covariance: np.ndarray, factor: np.ndarray, normals: np.ndarray) 
         return np.zeros((p, p))
     upper = factor[:p, :p] / norms
     # P
-    shrink = free @ np.linalg.lstsq(upper @ free, upper)[0] * norms / norms[:, None]
+    projection, *_ = np.linalg.lstsq(upper @ free, upper)
+    shrink = free @ projection * norms / norms[:, None]
     return np.asarray(shrink @ covariance @ shrink.T)
 
 
@@ -146,10 +150,12 @@ def within(
         NotConverged: where inequalities contradict each other, or no point makes the matrices definite.
     """
     p = len(factor) - 1
-    matrix = shaped(matrix, (None, p), "constraint matrix A")
+    shape = (None, p)
+    matrix = shaped(matrix, shape, "constraint matrix A")
     lower = np.asarray(lower, dtype=float)
     upper = np.asarray(upper, dtype=float)
-    sound = lower.shape == (len(matrix),) == upper.shape and not np.isnan([lower, upper]).any()
+    has_length = lower.shape == (len(matrix),) == upper.shape
+    sound = has_length and not np.isnan([lower, upper]).any()
     require(sound, f"bounds: expected {len(matrix)} lower and upper ones, none of them NaN")
     if (lower > upper).any():
         worst = int(np.argmax(lower - upper))
@@ -179,8 +185,10 @@ class _Planes:
     def __init__(self, factor: np.ndarray, rows: np.ndarray, sides: np.ndarray, equal: np.ndarray, fixed: np.ndarray):
         p = len(factor) - 1
         norms = np.linalg.norm(factor[:p, :p], axis=0)
-        self.upper = factor[:p, :p] / np.where(norms > 0.0, norms, 1.0)
-        require_rank(self.upper, [f"x{k + 1}" for k in range(p)])
+        safe_norms = np.where(norms > 0.0, norms, 1.0)
+        self.upper = factor[:p, :p] / safe_norms
+        names = [f"x{k + 1}" for k in range(p)]
+        require_rank(self.upper, names)
         self.length = float(np.linalg.norm(factor[:p, p])) or 1.0
         self.unit = self.length / norms
         self.target = factor[:p, p] / self.length
@@ -192,7 +200,8 @@ class _Planes:
         self.scaled = self.normals * self.unit / self.sizes[:, None]
         self.edges = self.sides / self.sizes
         self.factor = factor
-        self.free = scipy.linalg.solve_triangular(factor[:p, :p], factor[:p, p])
+        upper = factor[:p, :p]
+        self.free = scipy.linalg.solve_triangular(upper, factor[:p, p])
         self._require_solvable()
 
     def _require_solvable(self, max_contradiction: float = 1e-8) -> None:
@@ -214,7 +223,8 @@ class _Planes:
 
     def optimum(self, active: np.ndarray) -> Constrained:
         """Return the optimum under equalities and active inequalities (c,), the other inequalities ignored."""
-        binding = np.append(active, np.ones(len(self.sides) - self.count, dtype=bool))
+        equalities = np.ones(len(self.sides) - self.count, dtype=bool)
+        binding = np.append(active, equalities)
         normals = self.normals[binding]
         sides = self.sides[binding]
         values = np.array(self.free)
@@ -228,7 +238,8 @@ class _Planes:
             slope = self.upper.T @ (self.upper @ (values / self.unit) - self.target)
             multipliers[binding] = np.linalg.lstsq(self.scaled[binding].T, slope)[0]
         slack = np.where(binding, 0.0, self.normals @ values - self.sides)
-        return _frozen(values, multipliers * self.length**2 / self.sizes, slack, binding, self.normals)
+        scaled_multipliers = multipliers * self.length**2 / self.sizes
+        return _frozen(values, scaled_multipliers, slack, binding, self.normals)
 
     def bounded(self) -> Constrained:
         """Return the optimum under the inequalities, exact on the binding ones.
@@ -239,10 +250,13 @@ class _Planes:
         p = len(self.free)
         solution = self.definite(Definite(np.zeros((0, 1, 1, p)), 1.0))
         exact = self.optimum(solution.binding[:c])
-        away = np.linalg.norm(self.upper @ ((exact.values - solution.values) / self.unit))
+        relative = (exact.values - solution.values) / self.unit
+        away = np.linalg.norm(self.upper @ relative)
         # of ‖z‖, by which the optimum on the constraints that bind may be off the solver's
         max_move = 1e-3
-        good = (exact.slack >= 0.0).all() and (exact.multipliers[:c] >= 0.0).all() and away <= max_move
+        feasible = (exact.slack >= 0.0).all()
+        optimal = (exact.multipliers[:c] >= 0.0).all()
+        good = feasible and optimal and away <= max_move
         return exact if good else solution
 
     def definite(self, matrices: Definite) -> Constrained:
@@ -270,7 +284,8 @@ class _Planes:
             if not len(active):
                 active = np.argsort(small.least_eigenvalues(self.free / self.unit)[0])[:max_entering]
             goal = self.upper, self.target, rows[:c], -edges[:c]
-            solved = minimise(*goal, small.matrices[active], small.least, rows[c:], edges[c:])
+            active_matrices = small.matrices[active]
+            solved = minimise(*goal, active_matrices, small.least, rows[c:], edges[c:])
             b = solved.values
             mu = solved.rows
             pushes = solved.matrices
@@ -293,8 +308,10 @@ class _Planes:
         force[active[bind]] = traces[bind]
         slack = np.maximum(rows[:c] @ b - edges[:c], 0.0)
         all_rows = np.vstack([rows[:c], normals, rows[c:]])
-        binding = np.concatenate([mu > slack, force > 0.0, np.ones(len(rates), dtype=bool)])
-        scales = np.concatenate([self.sizes[:c], np.ones(len(force)), self.sizes[c:]])
+        equalities = np.ones(len(rates), dtype=bool)
+        binding = np.concatenate([mu > slack, force > 0.0, equalities])
+        unit_sizes = np.ones(len(force))
+        scales = np.concatenate([self.sizes[:c], unit_sizes, self.sizes[c:]])
         margins = np.where(force > 0.0, np.maximum(sizes, 0.0), sizes)
         gaps = np.concatenate([slack, margins, np.zeros(len(rates))])
         multipliers = np.concatenate([mu, force, rates]) * self.length**2 / scales

@@ -88,7 +88,8 @@ class Curved:
         return self.rows.T @ (0.5 * np.nan_to_num(bend + bend.T)) @ self.rows
 
     def _compare(self, u: np.ndarray, slope: np.ndarray) -> None:
-        differences = np.ravel(_differences(lambda x: np.array([self.h(x)]), u))
+        slopes = _differences(lambda x: np.array([self.h(x)]), u)
+        differences = np.ravel(slopes)
         size = _sizes(u)
         analytic = slope * size
         numeric = differences * size
@@ -112,7 +113,8 @@ class Curved:
 
 def _sizes(u: np.ndarray) -> np.ndarray:
     """Return the size (k,) of each argument, of at least a thousandth of the largest."""
-    return np.maximum(np.abs(u), max(1e-3 * float(np.abs(u).max()), 1e-9))
+    smallest = max(1e-3 * float(np.abs(u).max()), 1e-9)
+    return np.maximum(np.abs(u), smallest)
 
 
 def _differences(function: Callable[[np.ndarray], np.ndarray], u: np.ndarray) -> np.ndarray:
@@ -145,9 +147,11 @@ def make_curved(constraint: CurvedConstraint, row: Callable[[Mapping[str, float]
         refuse_option(location, "'slope' states the derivatives of a function; a formula has its own")
     if callable(h) and constraint.slope is not None:
         function = _called(h, location, 1)
-        slope = _called(constraint.slope, location, len(names))
+        count = len(names)
+        slope = _called(constraint.slope, location, count)
         return Curved(name, names, _rows(names, row), lambda u: float(function(u)[0]), slope, True)
-    tree, names = _parsed(str(h), location)
+    text = str(h)
+    tree, names = _parsed(text, location)
 
     def value(u: np.ndarray) -> float:
         return evaluated(tree, _KNOWN | dict(zip(names, u)), _OPERATIONS)
@@ -155,9 +159,14 @@ def make_curved(constraint: CurvedConstraint, row: Callable[[Mapping[str, float]
     # by complex steps, without rounding (Squire & Trapp 1998)
     def derivatives(u: np.ndarray) -> np.ndarray:
         step = 1e-30
-        return np.array([np.imag(value(u + 1j * step * direction)) / step for direction in np.eye(len(u))])
+        slopes = []
+        for direction in np.eye(len(u)):
+            shifted = value(u + 1j * step * direction)
+            slopes.append(np.imag(shifted) / step)
+        return np.array(slopes)
 
-    return Curved(name, names, _rows(names, row), value, derivatives, False)
+    rows = _rows(names, row)
+    return Curved(name, names, rows, value, derivatives, False)
 
 
 def _called(function: Callable[..., object], location: str, count: int) -> Callable[[np.ndarray], np.ndarray]:
@@ -186,7 +195,9 @@ def _parsed(text: str, location: str) -> tuple[ast.expr, tuple[str, ...]]:
         refuse_option(location, f"is not a formula of at most {MAX_FORMULA} characters: 'XX2 * ZZ2 >= XZ2**2'")
     if isinstance(tree, ast.Compare) and len(tree.ops) == 1 and isinstance(tree.ops[0], (ast.GtE, ast.LtE)):
         ends = (tree.left, tree.comparators[0])
-        larger, less = ends if isinstance(tree.ops[0], ast.GtE) else ends[::-1]
+        larger, less = ends
+        if not isinstance(tree.ops[0], ast.GtE):
+            larger, less = ends[::-1]
         tree = ast.BinOp(larger, ast.Sub(), less)
     try:
         with np.errstate(all="ignore"):
@@ -288,7 +299,8 @@ def _elastic(factor: np.ndarray, b: np.ndarray, bend: np.ndarray, unit: np.ndarr
     m = len(price)
     length = float(np.linalg.norm(factor[:-1, -1])) or 1.0
     values, vectors = np.linalg.eigh(bend * np.outer(unit, unit))
-    root = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T / unit
+    root_values = np.sqrt(np.maximum(values, 0.0))
+    root = root_values[:, None] * vectors.T / unit
     stacked = np.zeros((2 * p + 1 + m, p + m + 1))
     rows = slice(p + 1)
     bent = slice(p + 1, 2 * p + 1)

@@ -47,7 +47,8 @@ def tls(
     """
     p = data.parameters
     count = int(data.rows.sum())
-    noise = shaped(noise, (p + 1,), "noise of the columns and of y")
+    shape = (p + 1,)
+    noise = shaped(noise, shape, "noise of the columns and of y")
     if (noise < 0.0).any() or not noise.any():
         raise CalibError("noise of the columns and of y: no entry may be negative and at least one must be positive")
     factor = combine(data, std)
@@ -66,12 +67,16 @@ def tls(
     if inflation is not None:
         scale = np.sqrt(inflation - 1.0) / (1.0 if std is None else std)
         group_scale = np.broadcast_to(scale, (data.groups,))
-        prior_rows = (data.factors[:, :, :p] * group_scale[:, None, None]).reshape(-1, p)
+        scaled = data.factors[:, :, :p] * group_scale[:, None, None]
+        prior_rows = scaled.reshape(-1, p)
         independent = int(np.sum(data.rows / inflation))
-    covariance = _covariance(factor[:p, :p], noise, values, variance, count, data.names, prior_rows)
+    upper = factor[:p, :p]
+    covariance = _covariance(upper, noise, values, variance, count, data.names, prior_rows)
     dof = max(independent - p, 1)
-    estimate = Estimate(data.names, data.units, values, covariance, float(np.sqrt(variance)), dof)
-    group_std = np.sqrt(data.residual_squares(values) / np.maximum(data.rows * (1.0 - p / count), 1e-300))
+    residual_std = float(np.sqrt(variance))
+    estimate = Estimate(data.names, data.units, values, covariance, residual_std, dof)
+    freedoms = np.maximum(data.rows * (1.0 - p / count), 1e-300)
+    group_std = np.sqrt(data.residual_squares(values) / freedoms)
     return LinearFit(estimate, group_std, *condition_numbers(factor[:p, :p]))
 
 
@@ -85,7 +90,8 @@ def _null_direction(
     """
     exact = np.flatnonzero(noise == 0.0)
     noisy = np.flatnonzero(noise > 0.0)
-    upper = retriangulate(factor[:, np.concatenate([exact, noisy])])
+    stacked = factor[:, np.concatenate([exact, noisy])]
+    upper = retriangulate(stacked)
     k = len(exact)
     _, values, vt = np.linalg.svd(upper[k:, k:] / noise[noisy])
     edge = min(np.sqrt(len(noisy) / rows), 0.5)
@@ -101,7 +107,8 @@ def _null_direction(
     if k:
         if np.abs(np.diag(upper)[:k]).min() <= 1e-12 * np.abs(upper).max():
             raise Unidentifiable("the exact columns are dependent", [names[c] for c in exact if c < len(names)])
-        direction[exact] = -scipy.linalg.solve_triangular(upper[:k, :k], upper[:k, k:] @ direction[noisy])
+        coupled = upper[:k, k:] @ direction[noisy]
+        direction[exact] = -scipy.linalg.solve_triangular(upper[:k, :k], coupled)
     return direction, float(values[-1])
 
 
@@ -127,7 +134,9 @@ def _covariance(
     total = variance * noise[-1] ** 2 + column_noise @ x**2
     middle = np.diag(column_noise) * total - np.outer(column_noise * x, column_noise * x)
     extra = (prior_rows / norms) @ inverse
-    return (inverse * total + rows * inverse @ middle @ inverse + total * extra.T @ extra) / np.outer(norms, norms)
+    noise_part = rows * inverse @ middle @ inverse
+    extra_part = total * extra.T @ extra
+    return (inverse * total + noise_part + extra_part) / np.outer(norms, norms)
 
 
 CONSISTENT, CONSTRAINED = "; parameters satisfy [constraints]", " under constraints on its parameters"
@@ -148,9 +157,11 @@ def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray, inflation:
         inflation: (rows,) of the residuals; None: every row counts.
     """
     p = pooled.parameters
-    stacked = np.sum((pooled.factors / std[:, None, None]) ** 2, axis=(0, 1))
+    weighted = pooled.factors / std[:, None, None]
+    stacked = np.sum(weighted**2, axis=(0, 1))
     size = np.sqrt(stacked / max(float(pooled.rows.sum()), 1.0))
-    noise = np.append(np.where(exact, 0.0, COLUMN_NOISE * size[:p]), 1.0)
+    column_noise = np.where(exact, 0.0, COLUMN_NOISE * size[:p])
+    noise = np.append(column_noise, 1.0)
     return tls(pooled, noise, std, inflation)
 
 
@@ -196,13 +207,16 @@ def _reweighted(
     problem: IdentificationProblem, tau: np.ndarray, solve: Callable[[np.ndarray], np.ndarray] | None = None
 ) -> SampleFit:
     """Return the IRLS fit over whole samples, with the variance inflation of the most correlated row."""
-    return irls(samples_of(problem), inflation=float(np.max(tau)), solve=solve)
+    inflation = float(np.max(tau))
+    data = samples_of(problem)
+    return irls(data, inflation=inflation, solve=solve)
 
 
 def samples_of(problem: IdentificationProblem) -> Samples:
     """Return the rows of all recordings, grouped by sample."""
     rows = problem.rows
-    matrix = np.concatenate([part.matrix * part.weight[:, :, None] for part in rows])
+    weighted = [part.matrix * part.weight[:, :, None] for part in rows]
+    matrix = np.concatenate(weighted)
     target = np.concatenate([part.target * part.weight for part in rows])
     present = np.concatenate([part.present for part in rows])
     return stack(matrix, target, present, rows[0].names, rows[0].units)
@@ -231,13 +245,14 @@ TLS = LeastSquares(
 
 def _constrained(method: LeastSquares) -> _ConstrainedLeastSquares:
     """Return a least-squares method with the constraints of ``[constraints]``."""
+    description = method.name + CONSTRAINED
     return _ConstrainedLeastSquares(
         f"pc-{method.name}",
         method.assumes + CONSISTENT,
         method,
         tunes=method.tunes,
         version=method.version,
-        description=method.name + CONSTRAINED,
+        description=description,
         source="Sousa & Cortesão 2014; Wensing et al. 2018",
     )
 

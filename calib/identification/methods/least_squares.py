@@ -85,11 +85,14 @@ def _regularised(
     if prior is not None:
         prior_rows = np.sqrt(tempering) * prior.widened(pooled.parameters - base_count)
     _, ridges = estimate(pooled, std, inflation, group, prior_rows)
-    variances = np.where(group < 0, np.inf, np.maximum(ridges, 1e-12) ** 2)
+    ridge_variances = np.maximum(ridges, 1e-12) ** 2
+    variances = np.where(group < 0, np.inf, ridge_variances)
     covariance = np.diag(variances)
     if prior is not None:
         covariance[:base_count, :base_count] = prior.covariance / tempering
-    fit = ridge(pooled, np.zeros(len(ridges)), covariance, std * np.sqrt(inflation))
+    weighted_std = std * np.sqrt(inflation)
+    mean = np.zeros(len(ridges))
+    fit = ridge(pooled, mean, covariance, weighted_std)
     finite = np.isfinite(np.diag(covariance))
     root = np.linalg.cholesky(covariance[np.ix_(finite, finite)])
     whitened = np.zeros((len(root), len(ridges)))
@@ -119,7 +122,9 @@ def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, n
         fit, covariance, prior_rows = _regularised(problem, prior, std, inflation, tempering)
     values = _braking(problem, fit.estimate.values, std * np.sqrt(inflation), prior_rows)
     covariance[:base_count, :base_count] *= tempering
-    untempered = ridge(pooled, np.zeros(len(values)), covariance, std * np.sqrt(inflation))
+    weighted_std = std * np.sqrt(inflation)
+    mean = np.zeros(len(values))
+    untempered = ridge(pooled, mean, covariance, weighted_std)
     fit = replace(untempered, estimate=replace(untempered.estimate, values=values))
     return fit, prior_rows, std, inflation
 
@@ -130,8 +135,10 @@ def _braking(problem: IdentificationProblem, free: np.ndarray, std: np.ndarray, 
     speeds = [np.abs(case.motion.v).max(axis=0) for case in problem.cases]
     fastest = np.max(speeds, axis=0)
     augmented_prior = np.pad(prior_rows, ((0, 0), (0, 1)))
-    factor = retriangulate(np.vstack([combine(pooled, std), augmented_prior]))
-    values = bounded(factor, braking(terms, fastest))
+    stacked = np.vstack([combine(pooled, std), augmented_prior])
+    factor = retriangulate(stacked)
+    rows = braking(terms, fastest)
+    values = bounded(factor, rows)
     contradicted = _driving(problem, free)
     if contradicted.any():
         n = len(contradicted)
@@ -156,8 +163,10 @@ def _driving(problem: IdentificationProblem, values: np.ndarray) -> np.ndarray:
         return np.zeros(0, dtype=bool)
     richer_terms = [term for term in problem.terms[base.b :] if term is not None]
     richer_model = model.with_terms(*richer_terms)
-    standard = np.concatenate([base.to_standard(values[: base.b]), values[base.b :]])
-    return driving(Dynamics(richer_model, standard), problem.cases)
+    base_standard = base.to_standard(values[: base.b])
+    standard = np.concatenate([base_standard, values[base.b :]])
+    dynamics = Dynamics(richer_model, standard)
+    return driving(dynamics, problem.cases)
 
 
 OLS = LeastSquares(

@@ -87,7 +87,9 @@ class IdentificationProblem:
     @cached_property
     def pooled(self) -> Triangles:
         """R factors of all rows, one group per torque row."""
-        return pool(triangulate(self.rows), self.rows[0].target.shape[1])
+        data = triangulate(self.rows)
+        rows = self.rows[0].target.shape[1]
+        return pool(data, rows)
 
     @property
     def nonnegative(self) -> np.ndarray:
@@ -97,7 +99,8 @@ class IdentificationProblem:
     @property
     def exact(self) -> np.ndarray:
         """Mask (p,) of columns that have no noise from measured positions: constants and signs."""
-        return np.array([term is not None and term.form.exact for term in self.terms], dtype=bool)
+        exact = [term is not None and term.form.exact for term in self.terms]
+        return np.array(exact, dtype=bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,10 +174,12 @@ class MethodEstimate:
         if self.beforehand is None:
             return self.pooled, self.std, self.inflation
         # The prior is one more group of rows.
-        prior_factor = retriangulate(np.pad(self.beforehand, ((0, 0), (0, 1))))
+        with_target = np.pad(self.beforehand, ((0, 0), (0, 1)))
+        prior_factor = retriangulate(with_target)
         factors = np.concatenate([self.pooled.factors, prior_factor[None]])
         counts = [*self.pooled.rows, len(self.beforehand)]
-        data = replace(self.pooled, factors=frozen(factors), rows=frozen(counts, int))
+        rows = frozen(counts, int)
+        data = replace(self.pooled, factors=frozen(factors), rows=rows)
         return data, np.append(self.std, 1.0), np.append(self.inflation, 1.0)
 
 
@@ -183,10 +188,13 @@ def _equivalent_triangle(estimate: Estimate) -> Triangles:
     p = len(estimate.values)
     freedom = max(estimate.dof, 1)
     factor = np.zeros((1, p + 1, p + 1))
-    factor[0, :p] = retriangulate(whitened(estimate.values, estimate.covariance))[:p]
+    triangle = retriangulate(whitened(estimate.values, estimate.covariance))
+    factor[0, :p] = triangle[:p]
     factor[0, p, p] = np.sqrt(freedom)
     no_rows = empty(estimate.names, estimate.units, 1)
-    return replace(no_rows, factors=frozen(factor), rows=frozen([freedom + p], int))
+    factors = frozen(factor)
+    rows = frozen([freedom + p], int)
+    return replace(no_rows, factors=factors, rows=rows)
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,8 @@ class Constraints(Frozen):
             return self.touched(factor).solve(factor, free)
         p = len(factor) - 1
         if free is None:
-            free = np.linalg.solve(factor[:p, :p], factor[:p, p])
+            upper_triangle = factor[:p, :p]
+            free = np.linalg.solve(upper_triangle, factor[:p, p])
         postures = f"M(q) positive definite in {len(self.inertia)} postures"
         with _unsatisfied(f"no estimate satisfies {self} with {postures}: remove bounds, or record other motion"):
             definite = _definite(self.inertia, free, self.least, self.likely)
@@ -121,20 +122,20 @@ class Constraints(Frozen):
         linear = replace(self, curved=())
         m = len(self.curved)
         start = linear.solve(factor).values
-        least_squares = np.linalg.solve(factor[:-1, :-1], factor[:-1, -1])
+        upper_triangle = factor[:-1, :-1]
+        least_squares = np.linalg.solve(upper_triangle, factor[:-1, -1])
         free = np.append(least_squares, np.zeros(m))
 
         def solve(triangle: np.ndarray, rows: np.ndarray, lower: np.ndarray) -> Constrained:
             """Return the optimum of parameters and m further unknowns, with further inequalities."""
             wider = np.pad(self.matrix, ((0, 0), (0, m)))
-            further = replace(
-                linear,
-                names=("",) * len(rows) + self.names,
-                matrix=np.vstack([rows, wider]),
-                lower=np.append(lower, self.lower),
-                upper=np.append(np.full(len(lower), np.inf), self.upper),
-                inertia=np.pad(self.inertia, ((0, 0), (0, 0), (0, 0), (0, m))),
-            )
+            names = ("",) * len(rows) + self.names
+            matrix = np.vstack([rows, wider])
+            upper = np.append(np.full(len(lower), np.inf), self.upper)
+            padding = ((0, 0), (0, 0), (0, 0), (0, m))
+            inertia = np.pad(self.inertia, padding)
+            lower = np.append(lower, self.lower)
+            further = replace(linear, names=names, matrix=matrix, lower=lower, upper=upper, inertia=inertia)
             return further.solve(triangle, free)
 
         names = tuple(constraint.name for constraint in self.curved)
@@ -173,7 +174,9 @@ def make_constraints(
         UsageError: for an unknown name, a bound without effect on the torques, or contradicting bounds.
     """
     requests: list[tuple[str, Mapping[str, float], float, float]]
-    requests = [(name, {name: 1.0}, *bounds) for name, bounds in settings.bounds.items()]
+    requests = []
+    for name, bounds in settings.bounds.items():
+        requests.append((name, {name: 1.0}, *bounds))
     for number, weighted_sum in enumerate(settings.sum, 1):
         location = f"[[constraints.sum]] number {number}"
         low, high = weighted_sum.limits
@@ -227,7 +230,8 @@ def constraints_of(problem: IdentificationProblem) -> Constraints:
     Raises:
         UsageError: see `make_constraints`.
     """
-    names = (*problem.base.names, *problem.rows[0].names[problem.base.b :])
+    richer_names = problem.rows[0].names[problem.base.b :]
+    names = (*problem.base.names, *richer_names)
     settings = problem.constraints or ConstraintSettings()
     return make_constraints(settings, problem.model, problem.base, names, problem.terms)
 
@@ -259,7 +263,8 @@ def hold(
     covariance = restricted(np.asarray(free.covariance), factor, normals) * (1.0 if stated_noise else ratio)
     residual_std = free.residual_std * np.sqrt(ratio)
     estimate = replace(free, values=solution.values, covariance=covariance, residual_std=residual_std, dof=dof)
-    group = fit.group_std * np.sqrt(after / np.where(before > 0.0, before, np.inf))
+    group_ratio = after / np.where(before > 0.0, before, np.inf)
+    group = fit.group_std * np.sqrt(group_ratio)
     group_std = np.where(before > 0.0, group, fit.group_std)
     held_fit = replace(fit, estimate=estimate, group_std=group_std)
     return held_fit, _binding(constraints, solution, fit)
@@ -271,7 +276,9 @@ def _binding(constraints: Constraints, solution: Constrained, free: LinearFit) -
     low = np.flatnonzero(np.isfinite(constraints.lower) & ~equal)
     high = np.flatnonzero(np.isfinite(constraints.upper) & ~equal)
     postures = len(constraints.inertia)
-    places = np.concatenate([low, high, np.full(postures, -1), np.flatnonzero(equal)]).astype(int)
+    posture_places = np.full(postures, -1)
+    equalities = np.flatnonzero(equal)
+    places = np.concatenate([low, high, posture_places, equalities]).astype(int)
     upper = np.zeros(len(places), bool)
     upper[len(low) : len(low) + len(high)] = True
     binding = []
@@ -287,10 +294,12 @@ def _binding(constraints: Constraints, solution: Constrained, free: LinearFit) -
         multiplier = float(solution.multipliers[k])
         value = float(row @ free.estimate.values - origin)
         sigma = float(np.sqrt(max(row @ free.estimate.covariance @ row, 0.0)))
-        binding.append(Binding(name, multiplier, value, sigma, float(bound - origin), bool(equal[places[k]])))
+        is_equality = bool(equal[places[k]])
+        binding.append(Binding(name, multiplier, value, sigma, float(bound - origin), is_equality))
     tight = frozen(np.flatnonzero(solution.binding[places < 0]), int)
     findings = tuple(_findings(constraints, binding, len(tight)))
-    return Held(constraints.names, tuple(binding), tight, free, solution.normals[solution.binding], findings)
+    normals = solution.normals[solution.binding]
+    return Held(constraints.names, tuple(binding), tight, free, normals, findings)
 
 
 def _findings(constraints: Constraints, binding: Sequence[Binding], postures: int) -> Iterator[Finding]:
@@ -334,7 +343,8 @@ def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.n
         elif name in base.standard:
             standard[base.standard.index(name)] += weight
         else:
-            similar = suggestion(name, (*names, *base.standard))
+            choices = (*names, *base.standard)
+            similar = suggestion(name, choices)
             message = f"'{name}' is not a parameter of this model{similar}; its parameters: {', '.join(names)}"
             refuse_option("[constraints]", message)
     # T of the kept columns is the identity
@@ -380,4 +390,5 @@ def _definite(inertia: np.ndarray, free: np.ndarray, least: float, likely: np.nd
         return None
     size = np.abs(np.einsum("kiip,p->ki", inertia, free)).mean(axis=0)
     scale = 1.0 / np.sqrt(np.maximum(size, 1e-6 * size.max()))
-    return Definite(inertia * scale[:, None, None] * scale[None, :, None], least, likely)
+    matrices = inertia * scale[:, None, None] * scale[None, :, None]
+    return Definite(matrices, least, likely)

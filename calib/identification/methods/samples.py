@@ -44,7 +44,9 @@ def tuning(joints: int, efficiency: float = 0.95) -> float:
 
     def excess(constant: float) -> float:
         w = weights(np.sqrt(square), "huber", constant)
-        return float(np.mean(w * square) ** 2 / np.mean(w**2 * square) / joints - efficiency)
+        mean_square = np.mean(w * square) ** 2
+        fourth = np.mean(w**2 * square)
+        return float(mean_square / fourth / joints - efficiency)
 
     return float(brentq(excess, 0.05, 20.0 * np.sqrt(joints)))  # type: ignore[arg-type]
 
@@ -67,7 +69,8 @@ def weigh(size: np.ndarray, joints: np.ndarray, gated: bool = True) -> np.ndarra
 def consistency(joints: int) -> float:
     """Return c = E w / E[w d² / n], so that c Σ w e eᵀ / Σ w estimates S for normal residuals."""
     square = _quantiles(joints)
-    w = _weights(np.sqrt(square), joints)
+    size = np.sqrt(square)
+    w = _weights(size, joints)
     return float(np.mean(w) / np.mean(w * square) * joints)
 
 
@@ -80,8 +83,10 @@ def variance_factor(size: np.ndarray, joints: np.ndarray) -> float:
     n = np.maximum(joints, 1)
     w = weigh(size, joints)
     h = 1e-4
-    above = np.where(w > 0.0, weigh(size * (1.0 + h), joints, False), 0.0)
-    below = np.where(w > 0.0, weigh(size * (1.0 - h), joints, False), 0.0)
+    larger = weigh(size * (1.0 + h), joints, False)
+    above = np.where(w > 0.0, larger, 0.0)
+    smaller = weigh(size * (1.0 - h), joints, False)
+    below = np.where(w > 0.0, smaller, 0.0)
     # w' d
     slope = (above - below) / (2.0 * h)
     share = joints / joints.sum()
@@ -162,7 +167,8 @@ def stack(
     units: Sequence[str] | None = None,
 ) -> Samples:
     """Return samples checked for shape and finiteness, without a copy; see `Samples`."""
-    matrix = shaped(matrix, (None, None, None), "observation matrices W")
+    shape = (None, None, None)
+    matrix = shaped(matrix, shape, "observation matrices W")
     target = shaped(target, matrix.shape[:2], "target y")
     if present is None:
         present = np.ones(target.shape, dtype=bool)
@@ -200,7 +206,8 @@ def irls(data: Samples, inflation: float = 1.0, solve: Callable[[np.ndarray], np
         residual = np.where(data.present, data.target - data.matrix @ values, 0.0) / shares
         size = _sizes(residual, covariance, data.present)
         weights = weigh(size, data.joints)
-        covariance = _scatter(data, residual, weights * _consistent(data), weights)
+        scaled = weights * _consistent(data)
+        covariance = _scatter(data, residual, scaled, weights)
         factor = _factor(data, covariance, weights)
         last = values
         if solve is None:
@@ -222,7 +229,8 @@ def row_irls(data: Samples) -> LinearFit:
     for _ in range(ROUNDS):
         residual = data.target - data.matrix @ values
         std = _spreads(data, residual)
-        fit = wls(_triangles(data, robust.weights(np.abs(residual) / std, "cauchy")), std)
+        row_weights = robust.weights(np.abs(residual) / std, "cauchy")
+        fit = wls(_triangles(data, row_weights), std)
         step = fit.estimate.values - values
         values = fit.estimate.values
         if np.all(np.abs(step) <= 1e-3 * fit.estimate.sigma):
@@ -268,7 +276,8 @@ def _roots(noise: np.ndarray, present: np.ndarray) -> tuple[np.ndarray, np.ndarr
     for k, pattern in enumerate(patterns):
         block = np.ix_(pattern, pattern)
         lower = np.linalg.cholesky(noise[block])
-        roots[k][block] = scipy.linalg.solve_triangular(lower, np.eye(len(lower)), lower=True)
+        identity = np.eye(len(lower))
+        roots[k][block] = scipy.linalg.solve_triangular(lower, identity, lower=True)
     return roots, pattern_index.reshape(-1)
 
 
@@ -281,20 +290,23 @@ def _factor(data: Samples, noise: np.ndarray, weights: np.ndarray) -> np.ndarray
         part = slice(start, start + CHUNK)
         root = roots[pattern[part]] * np.sqrt(weights[part])[:, None, None]
         target = np.einsum("kij,kj->ki", root, data.target[part])
-        total = absorb(total, (root @ data.matrix[part]).reshape(-1, p), target.reshape(-1))
+        whitened = (root @ data.matrix[part]).reshape(-1, p)
+        total = absorb(total, whitened, target.reshape(-1))
     return total.factors[0]
 
 
 def _triangles(data: Samples, weights: np.ndarray) -> Triangles:
     """Return the R factors (QR) of all rows that are not missing, one group per joint, weighted by `weights` (N, n)."""
     root = np.sqrt(weights)
-    total = empty(data.names, data.units, data.target.shape[1])
+    groups = data.target.shape[1]
+    total = empty(data.names, data.units, groups)
     for start in range(0, len(data.target), CHUNK):
         part = slice(start, start + CHUNK)
         sample, joint = np.nonzero(data.present[part])
         scale = root[part][sample, joint]
         matrix = data.matrix[part][sample, joint] * scale[:, None]
-        total = absorb(total, matrix, data.target[part][sample, joint] * scale, joint)
+        target = data.target[part][sample, joint] * scale
+        total = absorb(total, matrix, target, joint)
     return total
 
 
@@ -310,7 +322,8 @@ def _spreads(data: Samples, residual: np.ndarray) -> np.ndarray:
 def _share_left(data: Samples, std: np.ndarray) -> np.ndarray:
     """Return 1 - h_j / r_j (n,), the share of joint j's noise variance that remains in its residuals."""
     triangles = _triangles(data, np.ones(data.target.shape))
-    leverages = leverage(triangles, std, solve_triangle(combine(triangles, std), data.names)[1])
+    inverse = solve_triangle(combine(triangles, std), data.names)[1]
+    leverages = leverage(triangles, std, inverse)
     return np.maximum(1.0 - leverages / np.maximum(triangles.rows, 1), 1e-3)
 
 

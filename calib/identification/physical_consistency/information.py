@@ -68,7 +68,8 @@ class Information(Frozen):
 
     def distance(self, standard: np.ndarray) -> float:
         """Return the Mahalanobis distance of standard parameters (p,) from the data's optimum, in sigmas."""
-        residual = self.factor[:, :-1] @ (self.transform @ standard) - self.factor[:, -1]
+        base_values = self.transform @ standard
+        residual = self.factor[:, :-1] @ base_values - self.factor[:, -1]
         square = float(residual @ residual) - self.best
         return float(np.sqrt(max(square, 0.0)))
 
@@ -77,6 +78,9 @@ def of(identification: Identification, chain: Chain) -> Information:
     """Return the information of the data of an identification in memory."""
     estimate = identification.fitted.estimate
     standard = identification.dynamics.model.names
+    groups = regrouping(identification.base)
+    transform = _transform(identification.names, groups, standard)
+    factor = _information(identification)
     return Information(
         chain=chain,
         dynamics=identification.dynamics,
@@ -84,8 +88,8 @@ def of(identification: Identification, chain: Chain) -> Information:
         units=estimate.units,
         values=estimate.values,
         covariance=estimate.covariance,
-        transform=_transform(identification.names, regrouping(identification.base), standard),
-        factor=_information(identification),
+        transform=transform,
+        factor=factor,
     )
 
 
@@ -103,15 +107,18 @@ def _information(identification: Identification) -> np.ndarray:
     factors = [combine(data, std * np.sqrt(inflation))]
     richer_count = len(identification.names) - base_count
     if richer_count:
-        group = np.concatenate([np.full(base_count, -1), identification.friction.groups]).astype(int)
+        base_groups = np.full(base_count, -1)
+        group = np.concatenate([base_groups, identification.friction.groups]).astype(int)
         prior_rows = None
         if identification.prior is not None:
             prior_rows = identification.prior.widened(richer_count)
         _, ridges = estimate(fitted.pooled, fitted.std, fitted.inflation, group, prior_rows)
         ridge_rows = np.zeros((richer_count, base_count + richer_count + 1))
-        ridge_rows[:, base_count:-1] = np.diag(1.0 / np.maximum(ridges[base_count:], 1e-12))
+        richer_ridges = np.maximum(ridges[base_count:], 1e-12)
+        ridge_rows[:, base_count:-1] = np.diag(1.0 / richer_ridges)
         factors.append(ridge_rows)
-    return retriangulate(np.vstack(factors))
+    stacked = np.vstack(factors)
+    return retriangulate(stacked)
 
 
 def read(folder: str | Path, model: tuple[Chain, Dynamics] | None = None) -> Information:

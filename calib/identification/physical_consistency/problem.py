@@ -90,7 +90,8 @@ def _cad(chain: Chain, model: IdentificationModel, is_payload: np.ndarray) -> Pr
             drawn[i] = False
             notes.append(f"body {label} has no mass in the CAD: weakly regularised towards {light_mass:.2g} kg")
         elif pseudo_inertia.margin(described[i]) < THIN:
-            bodies[i] = _thickened(described[i])
+            body = described[i]
+            bodies[i] = _thickened(body)
             if pseudo_inertia.margin(described[i]) < 0.0:
                 notes.append(
                     f"CAD inertia of body {label} is physically inconsistent: the nearest consistent one is used"
@@ -164,14 +165,18 @@ def make_problem(information: Information, references: PriorBodies) -> BodyCost:
     for k, term in enumerate(model.columns):
         if term.shape == "acceleration" and positive[k]:
             sizes[k] = min(sizes[k], mass * ROTOR**2)
+    factor = np.column_stack([columns, target])
+    fixed = information.dynamics.values[inertial:]
+    reference_bodies = pseudo_inertia.from_standard(references.parameters)
+    unidentified_sizes = np.where(identified, sizes, 0.0)
     return BodyCost(
-        factor=np.column_stack([columns, target]),
+        factor=factor,
         bodies=model.bodies.count,
-        references=pseudo_inertia.from_standard(references.parameters),
+        references=reference_bodies,
         drawn=references.drawn,
-        sizes=np.where(identified, sizes, 0.0),
+        sizes=unidentified_sizes,
         positive=positive,
-        fixed=information.dynamics.values[inertial:],
+        fixed=fixed,
     )
 
 
@@ -195,7 +200,8 @@ def nearest(problem: BodyCost, spared: int | None = None, pull: float = 0.0) -> 
     goal = retriangulate(np.column_stack([columns, target]))[:-1]
     if pull > 0.0:
         goal = np.vstack([goal, _euclidean_prior(problem, pull)])
-    goal = goal / max(1.0, float(np.linalg.norm(goal[:, -1])))
+    target_norm = float(np.linalg.norm(goal[:, -1]))
+    goal = goal / max(1.0, target_norm)
 
     # Bounds: the trace of each body, except of the spared one, and positive terms.
     bodies = pseudo_inertia.unknown_bodies(count, len(problem.sizes))
@@ -205,7 +211,8 @@ def nearest(problem: BodyCost, spared: int | None = None, pull: float = 0.0) -> 
     rows = np.vstack([traces, term_rows[positive]])
     offset = np.repeat([1.0, 0.0], [count, len(positive)])
     lower = np.where(np.arange(count) == spared, -4.0 * MAX_TRACE, 0.0)
-    solution = minimise(goal[:, :-1], goal[:, -1], rows, offset, bodies, lower)
+    upper = goal[:, :-1]
+    solution = minimise(upper, goal[:, -1], rows, offset, bodies, lower)
     parameters = coordinates @ solution.values
     parameters[inertial:] += fixed_values
     return np.asarray(parameters)
@@ -220,7 +227,8 @@ def _euclidean_prior(problem: BodyCost, pull: float) -> np.ndarray:
         root = np.sqrt(0.5 * weight)
         blocks.append(root * basis)
         targets.append(root * identity)
-    terms = np.sqrt(np.where(problem.positive, 0.5 * DRIVE, 1.0)) * (problem.sizes > 0.0)
+    weights = np.sqrt(np.where(problem.positive, 0.5 * DRIVE, 1.0))
+    terms = weights * (problem.sizes > 0.0)
     blocks.append(np.diag(terms))
     targets.append(terms * problem.positive)
     matrix = np.asarray(scipy.linalg.block_diag(*blocks))

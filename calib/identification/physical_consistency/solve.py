@@ -205,25 +205,31 @@ def find_possible(information: Information, weight: float | None = None, prior: 
             values = nearest(problem, pull=gamma) if euclidean else solve(problem, gamma)
     curvature_at = _reference(problem) if euclidean else values
     margins = [pseudo_inertia.margin(body) for body in _bodies(problem, values)]
+    dynamics = Dynamics(model, values)
+    covariance = _covariance(problem, gamma, curvature_at)
+    notes = (*best.references.notes, *_notes(model, problem, values))
+    distance = information.distance(values)
+    reached_margins = np.array(margins)
     return PossibleBodies(
-        dynamics=Dynamics(model, values),
-        covariance=_covariance(problem, gamma, curvature_at),
+        dynamics=dynamics,
+        covariance=covariance,
         weight=gamma,
         doubt=doubt,
-        margins=np.array(margins),
-        distance=information.distance(values),
+        margins=reached_margins,
+        distance=distance,
         nearest=nearest_distance,
         allowed=allowed,
         blamed=blamed,
         source=best.references.source,
         prior=prior,
-        notes=(*best.references.notes, *_notes(model, problem, values)),
+        notes=notes,
     )
 
 
 def _candidates(references: PriorBodies, problem: BodyCost, weight: float | None, doubt: float) -> Iterator[_Candidate]:
     """Yield the optimum for each prior weight with its evidence; the data's sigmas are widened by `doubt`."""
-    widened = replace(problem, factor=problem.factor / doubt)
+    factor = problem.factor / doubt
+    widened = replace(problem, factor=factor)
     weights: Sequence[float] = WEIGHTS[4::3]
     if weight is not None:
         weights = [weight]
@@ -270,7 +276,8 @@ def _descend(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
     for _ in range(MAX_STEPS):
         slope, curvature = derivatives(problem, gamma, values)
         step = np.zeros_like(values)
-        step[free] = -_solved(curvature[np.ix_(free, free)], slope[free])
+        free_curvature = curvature[np.ix_(free, free)]
+        step[free] = -_solved(free_curvature, slope[free])
         decrement = -float(slope @ step)
         if decrement < settled:
             return values + step
@@ -302,7 +309,8 @@ def cost(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
         bodies = bodies + weight * pseudo_inertia.divergence(body, reference)
     drives = problem.lift * DRIVE * float(np.sum(ratio - np.log(ratio) - 1.0))
     unbounded = estimated & ~problem.positive
-    unbounded_terms = float(np.sum((terms[unbounded] / problem.sizes[unbounded]) ** 2))
+    relative = terms[unbounded] / problem.sizes[unbounded]
+    unbounded_terms = float(np.sum(relative**2))
     return 0.5 * (float(residual @ residual) + bodies + drives + unbounded_terms)
 
 
@@ -342,12 +350,15 @@ def _evidence(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
     curvature = curvature[np.ix_(free, free)]
     unit = np.sqrt(np.diag(curvature))
     root = np.linalg.cholesky(curvature / np.outer(unit, unit))
-    half_log_det = float(np.log(np.diag(root)).sum() + np.log(unit).sum())
+    log_diagonal = np.log(np.diag(root)).sum()
+    half_log_det = float(log_diagonal + np.log(unit).sum())
     nu = gamma + 5.0
-    norm = 2.0 * nu * np.log(gamma) - 2.0 * gamma - 2.0 * nu * np.log(2.0) - float(multigammaln(nu / 2.0, 4))
+    log_gamma = float(multigammaln(nu / 2.0, 4))
+    norm = 2.0 * nu * np.log(gamma) - 2.0 * gamma - 2.0 * nu * np.log(2.0) - log_gamma
     # The scale of P⁰ counts where references compete.
     scale = 2.5 * float(np.linalg.slogdet(problem.references)[1].sum())
-    return -cost(problem, gamma, values) - half_log_det + norm * float(problem.drawn.sum()) - scale
+    drawn_norm = norm * float(problem.drawn.sum())
+    return -cost(problem, gamma, values) - half_log_det + drawn_norm - scale
 
 
 def _covariance(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
@@ -355,7 +366,8 @@ def _covariance(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarr
     free = np.ix_(problem.free, problem.free)
     _, curvature = derivatives(problem, gamma, values)
     covariance = np.zeros((len(values), len(values)))
-    covariance[free] = _solved(curvature[free], np.eye(int(problem.free.sum())))
+    identity = np.eye(int(problem.free.sum()))
+    covariance[free] = _solved(curvature[free], identity)
     return 0.5 * (covariance + covariance.T)
 
 
@@ -439,4 +451,5 @@ def contradiction(identification: Identification, chain: Chain) -> Contradiction
     if not np.isfinite(distance):
         return None
     torque = float(np.linalg.norm(information.factor[:, -1]))
-    return Contradiction(float(distance), allowed, 100.0 * float(distance) / torque)
+    unexplained = 100.0 * float(distance) / torque
+    return Contradiction(float(distance), allowed, unexplained)

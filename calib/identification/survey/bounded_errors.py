@@ -54,15 +54,19 @@ class _GeneralisedTLS(Method):
                 eigenvalues,
             )
         values = np.linalg.solve(gram, upper.T @ factor[:p, p])
-        meat = np.outer(noise @ values, noise @ values) / max(float(problem.pooled.rows.sum()), 1.0)
+        predicted_noise = noise @ values
+        row_count = max(float(problem.pooled.rows.sum()), 1.0)
+        meat = np.outer(predicted_noise, predicted_noise) / row_count
         for part in states.parts:
             in_use = states.present[part.own]
-            weighted = np.where(in_use[:, :, None], states.matrix[part.own] / std[:, None], 0.0)
+            scaled = states.matrix[part.own] / std[:, None]
+            weighted = np.where(in_use[:, :, None], scaled, 0.0)
             white = weighted / norms
             residual = np.where(in_use, states.target[part.own] / std, 0.0) - white @ values
             meat += scatter(white, residual)
         bread = np.linalg.inv(gram) / norms[:, None]
-        estimate = replace(plain.estimate, values=values / norms, covariance=bread @ meat @ bread.T, residual_std=1.0)
+        covariance = bread @ meat @ bread.T
+        estimate = replace(plain.estimate, values=values / norms, covariance=covariance, residual_std=1.0)
         group = np.sqrt(problem.pooled.residual_squares(estimate.values) / problem.pooled.rows)
         fit = replace(plain, estimate=estimate, group_std=group)
         return MethodEstimate(self.name, EstimateStatus.FOUND, fit, problem.pooled, std, tau, alone=True)
@@ -73,7 +77,8 @@ def column_noise(states: NoisyStates, std: np.ndarray) -> np.ndarray:
     p = states.matrix.shape[2]
     total = np.zeros((p, p))
     for part in states.parts:
-        scale = np.where(states.present[part.own], 1.0 / std, 0.0)[:, :, None]
+        weights = np.where(states.present[part.own], 1.0 / std, 0.0)
+        scale = weights[:, :, None]
         for joint, covariance in enumerate(part.noise):
             sizes, axes = np.linalg.eigh(covariance)
             # of one standard deviation
@@ -106,7 +111,8 @@ class _SetMembership(Method):
         std, tau = weighed(problem)
         plain = wls(problem.pooled, std)
         data = samples_of(problem)
-        residual = np.where(data.present, data.target - data.matrix @ plain.estimate.values, 0.0)
+        predicted = data.matrix @ plain.estimate.values
+        residual = np.where(data.present, data.target - predicted, 0.0)
         bound = np.maximum(np.abs(residual).max(axis=0), 1e-9 * std)
         rows = (data.matrix / bound[:, None])[data.present]
         ends = (residual / bound)[data.present]
@@ -158,7 +164,8 @@ def intervals(rows: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarra
         active = np.union1d(active, np.argmax(violated[:, violating], axis=0))
         ahead = ahead[violating]
         rounds = rounds + 1
-    best = np.einsum("kp,kp->k", np.tile(np.linalg.inv(upper), (2, 1)), optima)
+    inverse = np.linalg.inv(upper)
+    best = np.einsum("kp,kp->k", np.tile(inverse, (2, 1)), optima)
     return best[:p], best[p:], rounds
 
 

@@ -57,21 +57,25 @@ class _KalmanFilter(Method):
         plain = WLS.estimate(problem)
         if not plain.found:
             return replace(plain, method=self.name)
-        return attempted(self.name, problem, lambda: self._estimate(problem, plain, believed_robot(problem, self)))
+        believed = believed_robot(problem, self)
+        return attempted(self.name, problem, lambda: self._estimate(problem, plain, believed))
 
     def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, robot: BelievedRobot) -> MethodEstimate:
         values = plain.estimate.values
         sigma = plain.estimate.sigma
-        start = start_of(problem, values, _inertia(problem), lambda x: _moves(robot, problem, x))
+        inertia = _inertia(problem)
+        start = start_of(problem, values, inertia, lambda x: _moves(robot, problem, x))
         # standard deviations of least squares that the parameters are uncertain by at first
         start_sigmas = 5.0
         wide = np.maximum(start_sigmas * sigma, np.abs(start - values))
         # of one sample of the torques
         noise = plain.std / np.sqrt(np.sum(np.square(problem.decimator.taps)))
-        state = _State(robot, self.kind, start, np.diag(wide**2), [], 0)
+        covariance = np.diag(wide**2)
+        state = _State(robot, self.kind, start, covariance, [], 0)
         for case in problem.cases:
             for first, last in segments(case.motion.segment):
-                state = _pass(state, case, slice(first, last), noise)
+                part = slice(first, last)
+                state = _pass(state, case, part, noise)
         if state.sizes:
             innovation = float(np.mean(state.sizes))
         else:
@@ -83,9 +87,8 @@ class _KalmanFilter(Method):
                 f"{self.name} diverged: its innovations are {np.sqrt(innovation):.3g} times the predicted ones",
                 state.mean,
             )
-        estimate = replace(
-            plain.estimate, values=state.mean, covariance=max(1.0, innovation) * state.covariance, residual_std=1.0
-        )
+        covariance = max(1.0, innovation) * state.covariance
+        estimate = replace(plain.estimate, values=state.mean, covariance=covariance, residual_std=1.0)
         fit = LinearFit(estimate, plain.std, plain.fit.condition, plain.fit.condition_normalised)
         return replace(
             plain,
@@ -121,7 +124,8 @@ def _inertia(problem: IdentificationProblem) -> np.ndarray:
         tau = case.target - case.target.mean(axis=0)
         cross += np.sum(a * tau, axis=0)
         size += np.sum(a**2, axis=0)
-    return np.maximum(cross / size, 0.1 * np.max(np.abs(cross) / size))
+    ratio = cross / size
+    return np.maximum(ratio, 0.1 * np.max(np.abs(cross) / size))
 
 
 def _moves(robot: BelievedRobot, problem: IdentificationProblem, values: np.ndarray) -> None:
@@ -144,7 +148,8 @@ def _steps(case: Case, part: slice, max_step: float = 2.5e-3) -> Iterator[tuple[
     q = motion.q[part]
     tau = low_passed(case.target[part], motion)
     means = 0.5 * (tau[1:] + tau[:-1])
-    cumulated = np.concatenate([np.zeros((1, motion.n)), np.cumsum(means, axis=0)])
+    cumulated_means = np.cumsum(means, axis=0)
+    cumulated = np.concatenate([np.zeros((1, motion.n)), cumulated_means])
     steps = max(1, int(np.ceil(thin / (motion.rate * max_step) - 1e-6)))
     indices = np.arange(len(q), dtype=float)
     for k in range(thin, len(q), thin):
@@ -157,7 +162,8 @@ def _steps(case: Case, part: slice, max_step: float = 2.5e-3) -> Iterator[tuple[
 
 def _thin(case: Case, rate_factor: float = 4.0) -> int:
     # rate_factor: times the positions' cut-off: rate of the filter, at least
-    return max(1, int(case.motion.rate / (rate_factor * float(case.motion.cutoff.max()))))
+    max_rate = rate_factor * float(case.motion.cutoff.max())
+    return max(1, int(case.motion.rate / max_rate))
 
 
 def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
@@ -169,17 +175,22 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
         return before
     columns = before.robot.columns
     p = len(before.mean)
-    robot_stepper = stepper(before.robot.at(before.mean, case), columns)
+    plant = before.robot.at(before.mean, case)
+    robot_stepper = stepper(plant, columns)
     carried = before.robot.carried(case)
     least_noise = 1e-9 * np.ptp(motion.q, axis=0).max()
     position_noise = np.maximum(motion.cutoffs.noise / np.sqrt(thin), least_noise)
     period = thin / motion.rate
     torque = noise * np.sqrt(1.0 / thin)
-    moving = np.maximum(motion.velocity_noise(), 1e-3 * np.abs(motion.v).max(axis=0))
+    slow = 1e-3 * np.abs(motion.v).max(axis=0)
+    moving = np.maximum(motion.velocity_noise(), slow)
     first = np.concatenate([motion.q[part.start], motion.v[part.start], before.mean])
-    belief = believe(first, np.concatenate([position_noise, moving, np.ones(p)]), before.kind)
-    belief = replace(belief, spread=_joined(belief, before.covariance, 2 * n))
-    full = _Stepping(robot_stepper, before.kind, n, len(before.robot.plant.parameters), columns, carried)
+    first_sigma = np.concatenate([position_noise, moving, np.ones(p)])
+    belief = believe(first, first_sigma, before.kind)
+    spread = _joined(belief, before.covariance, 2 * n)
+    belief = replace(belief, spread=spread)
+    parameter_count = len(before.robot.plant.parameters)
+    full = _Stepping(robot_stepper, before.kind, n, parameter_count, columns, carried)
     sizes = []
     for q, tau in _steps(case, part):
         belief = full.step(belief, np.ascontiguousarray(tau), period / len(tau), torque)
@@ -190,7 +201,8 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
     mean = belief.mean[2 * n :]
     covariance = belief.covariance[2 * n :, 2 * n :]
     all_sizes = [*before.sizes, *settled]
-    return replace(before, mean=mean, covariance=covariance, sizes=all_sizes, count=before.count + 1)
+    count = before.count + 1
+    return replace(before, mean=mean, covariance=covariance, sizes=all_sizes, count=count)
 
 
 def _joined(belief: Belief, parameters: np.ndarray, first: int) -> np.ndarray:
@@ -227,7 +239,9 @@ class _Stepping:
             slopes = np.eye(len(mean))
             gain = np.eye(n)
             for torques in tau:
-                outcome = self.stepper.linearised(values, mean[:n], mean[n : 2 * n], torques, period, len(self.columns))
+                q = mean[:n]
+                v = mean[n : 2 * n]
+                outcome = self.stepper.linearised(values, q, v, torques, period, len(self.columns))
                 mean[:n], mean[n : 2 * n], gain, part = outcome
                 part[:, 2 * n :] *= self.carried
                 slopes[: 2 * n] = part[:, : 2 * n] @ slopes[: 2 * n]

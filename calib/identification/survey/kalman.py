@@ -75,14 +75,16 @@ class Belief:
 
 def believe(mean: np.ndarray, sigma: np.ndarray, kind: Filter) -> Belief:
     """Return the belief with a mean (L,) and independent components of standard deviation sigma (L,)."""
-    return Belief(np.array(mean, dtype=float), np.diag(sigma if kind.root else sigma**2), kind.root)
+    spread = np.diag(sigma if kind.root else sigma**2)
+    return Belief(np.array(mean, dtype=float), spread, kind.root)
 
 
 def points(before: Belief, kind: Filter, narrower: float = 1.0) -> np.ndarray:
     """Return the sigma points (2 L + 1, L) of a belief, the mean first; `narrower` scales their distance."""
     deviations = before.deviations
     gamma = narrower * _gamma(kind, len(before.mean))
-    return np.concatenate([before.mean[None], before.mean + gamma * deviations.T, before.mean - gamma * deviations.T])
+    steps = gamma * deviations.T
+    return np.concatenate([before.mean[None], before.mean + steps, before.mean - steps])
 
 
 def predicted(images: np.ndarray, noise: np.ndarray, kind: Filter, narrower: float = 1.0) -> Belief:
@@ -97,10 +99,12 @@ def predicted(images: np.ndarray, noise: np.ndarray, kind: Filter, narrower: flo
     if kind.rule == "cdkf":
         first = 0.5 / gamma * (ahead - behind)
         second = np.sqrt(max(gamma**2 - 1.0, 0.0)) * share * (ahead + behind)
-        return _packed(middle + shift, np.vstack([first, second]).T, noise, kind, 0.0, shift)
+        outer = np.vstack([first, second]).T
+        return _packed(middle + shift, outer, noise, kind, 0.0, shift)
     outer = np.sqrt(share) * np.vstack([ahead, behind])
     # Σ w (f - m⁺)(f - m⁺)ᵀ about f_0: with Σ w_i = 1 and w_0^c = w_0 + 1 - α² + β, β - α² is left of the middle ones
-    return _packed(middle + shift, outer.T, noise, kind, BETA - (narrower * ALPHA) ** 2, shift)
+    centre_weight = BETA - (narrower * ALPHA) ** 2
+    return _packed(middle + shift, outer.T, noise, kind, centre_weight, shift)
 
 
 def linearly_predicted(before: Belief, mean: np.ndarray, slopes: np.ndarray, noise: np.ndarray, kind: Filter) -> Belief:
@@ -124,7 +128,8 @@ def corrected(before: Belief, measured: np.ndarray, rows: int, std: np.ndarray) 
         array[rows:, rows:] = before.spread
         lower = _triangle(array)
         white = scipy.linalg.solve_triangular(lower[:rows, :rows], innovation, lower=True)
-        after = Belief(before.mean + lower[rows:, :rows] @ white, lower[rows:, rows:], True)
+        correction = lower[rows:, :rows] @ white
+        after = Belief(before.mean + correction, lower[rows:, rows:], True)
         return after, float(white @ white)
     cross = before.spread[:, :rows]
     innovation_covariance = cross[:rows] + np.diag(std**2)
@@ -132,7 +137,8 @@ def corrected(before: Belief, measured: np.ndarray, rows: int, std: np.ndarray) 
     remainder = np.eye(size)
     remainder[:, :rows] -= gain
     spread = remainder @ before.spread @ remainder.T + (gain * std**2) @ gain.T
-    after = Belief(before.mean + gain @ innovation, 0.5 * (spread + spread.T), False)
+    mean = before.mean + gain @ innovation
+    after = Belief(mean, 0.5 * (spread + spread.T), False)
     return after, float(innovation @ np.linalg.solve(innovation_covariance, innovation))
 
 
@@ -147,7 +153,8 @@ def _packed(
     wide = np.hstack([deviations, noise, np.sqrt(weight) * extra[:, None]])
     if kind.root:
         return Belief(mean, _triangle(wide), True)
-    return Belief(mean, wide @ wide.T, False)
+    spread = wide @ wide.T
+    return Belief(mean, spread, False)
 
 
 def _triangle(wide: np.ndarray) -> np.ndarray:

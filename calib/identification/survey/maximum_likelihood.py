@@ -67,9 +67,11 @@ class _MaximumLikelihood(Method):
         # standard deviations of the estimate
         tolerance = 0.01
         for count in range(1, max_steps + 1):
-            noise = _torque_noise(task, values, noise, (min_noise * std) ** 2)
+            minimum = (min_noise * std) ** 2
+            noise = _torque_noise(task, values, noise, minimum)
             iteration = _step(task, values, noise)
-            steps.append(float(np.max(np.abs(iteration.values - values) / iteration.sigma)))
+            relative_steps = np.abs(iteration.values - values) / iteration.sigma
+            steps.append(float(np.max(relative_steps)))
             values = iteration.values
             if not np.all(np.isfinite(values)) or (count > 5 and steps[-1] > 10.0 * steps[0]):
                 raise Diverged("maximum likelihood diverged: too much position noise for a linear model", values)
@@ -80,13 +82,15 @@ class _MaximumLikelihood(Method):
                 f"maximum likelihood still changes by {steps[-1]:.2g} standard deviations after {max_steps} rounds",
                 values,
             )
+        solution = _packed(problem, iteration, noise)
+        inflation = residual_inflation(problem.rows, values)
         return MethodEstimate(
             self.name,
             EstimateStatus.FOUND,
-            _packed(problem, iteration, noise),
+            solution,
             problem.pooled,
             np.sqrt(noise),
-            residual_inflation(problem.rows, values),
+            inflation,
             iterations=count,
             alone=True,
         )
@@ -128,13 +132,15 @@ class NoisyStates:
 def noisy_states(problem: IdentificationProblem, model: IdentificationModel) -> NoisyStates:
     """Return all samples of a problem, with the covariance of the noise in q, v and a."""
     samples, (model, columns) = samples_of(problem), with_friction(problem, model)
-    smooth = np.array([term is None or term.form.slopes for term in problem.terms], dtype=bool)
+    is_smooth = [term is None or term.form.slopes for term in problem.terms]
+    smooth = np.array(is_smooth, dtype=bool)
     parts = []
     first = 0
     for case in problem.cases:
         motion = case.motion
         index = kept(motion.segment, problem.decimator)
-        carried = np.append(model.carried_columns(case.carried), np.ones(model.p - model.inertial))
+        drive_columns = np.ones(model.p - model.inertial)
+        carried = np.append(model.carried_columns(case.carried), drive_columns)
         noise = noise_of_states(motion, problem.decimator)
         part = slice(first, first + len(index))
         q = motion.q[index]
@@ -158,8 +164,11 @@ def noise_of_states(motion: Motion, decimator: Decimator) -> np.ndarray:
         impulse[reach] = 1.0
         q = low_pass(impulse, motion.rate, float(cutoff))
         less = low_pass(impulse, motion.rate, float(faster))
-        states = np.stack([q, slope(less, motion.rate), curvature(q, motion.rate)])
-        response = np.array([np.convolve(state, decimator.taps) for state in np.nan_to_num(states)])
+        v = slope(less, motion.rate)
+        a = curvature(q, motion.rate)
+        states = np.stack([q, v, a])
+        responses = [np.convolve(state, decimator.taps) for state in np.nan_to_num(states)]
+        response = np.array(responses)
         result[np.all(cutoffs == (cutoff, faster), axis=1)] = response @ response.T
     return result * (motion.cutoffs.noise**2)[:, None, None]
 
@@ -197,7 +206,8 @@ def _residuals(task: NoisyStates, part: _Recording, values: np.ndarray) -> tuple
 def _inverse(position_part: np.ndarray, noise: np.ndarray, in_use: np.ndarray) -> np.ndarray:
     """Return the inverse (M, n, n) of S = Σ_τ + position_part for the rows in use (M, n); zero for other rows."""
     pairs = in_use[:, :, None] & in_use[:, None, :]
-    covariance = np.where(pairs, position_part + np.diag(noise), np.eye(len(noise)))
+    full = position_part + np.diag(noise)
+    covariance = np.where(pairs, full, np.eye(len(noise)))
     return np.where(pairs, np.linalg.inv(covariance), 0.0)
 
 
@@ -217,7 +227,8 @@ def _torque_noise(task: NoisyStates, values: np.ndarray, noise: np.ndarray, mini
     for _ in range(50):
         inverse = _inverse(position_part, noise, task.present)
         score = np.sum(np.einsum("mij,mj->mi", inverse, residual) ** 2, axis=0) / share
-        ratio = np.clip(score / np.maximum(np.einsum("mii->i", inverse), 1e-300), 0.1, 10.0)
+        diagonal = np.maximum(np.einsum("mii->i", inverse), 1e-300)
+        ratio = np.clip(score / diagonal, 0.1, 10.0)
         before = noise
         noise = np.where(observed, np.maximum(noise * ratio, minimum), noise)
         if np.max(np.abs(noise / before - 1.0)) < 1e-3:
@@ -255,14 +266,16 @@ def _step(task: NoisyStates, values: np.ndarray, noise: np.ndarray) -> _Round:
         error = np.einsum("mkjr,mrs,ms->mkj", spread, inverse, residual)
         corrected = task.matrix[part.own] + changed(task, part, error)
         rows = np.where(in_use[:, :, None], corrected, 0.0)
-        weights = np.where(in_use[:, :, None], inverse, np.eye(len(noise)))
+        identity = np.eye(len(noise))
+        weights = np.where(in_use[:, :, None], inverse, identity)
         root = np.linalg.cholesky(weights).transpose(0, 2, 1)
         white.append(root @ rows)
         white_residuals.append((root @ residual[:, :, None])[:, :, 0])
         cross += np.einsum("mip,miq->pq", inverse @ rows, task.matrix[part.own], optimize=True)
         score += np.einsum("mip,mi->p", white[-1], white_residuals[-1])
     size = np.sqrt(np.abs(np.diag(cross)))
-    bread = np.linalg.inv(cross / np.outer(size, size)) / np.outer(size, size)
+    scale = np.outer(size, size)
+    bread = np.linalg.inv(cross / scale) / scale
     return _Round(values + bread @ score, bread, tuple(white), tuple(white_residuals))
 
 
@@ -278,21 +291,26 @@ def changed(task: NoisyStates, part: _Recording, error: np.ndarray) -> np.ndarra
             load = None
         else:
             load = np.zeros_like(state[0])
-        before = task.model.regressor(state[0], state[1], state[2], load, part.carried)
-        after = task.model.regressor(shifted[0], shifted[1], shifted[2], load, part.carried)
-        out[block][:, :, smooth] = (after - before)[:, :, task.columns[smooth]]
+        q, v, a = state
+        before = task.model.regressor(q, v, a, load, part.carried)
+        shifted_q, shifted_v, shifted_a = shifted
+        after = task.model.regressor(shifted_q, shifted_v, shifted_a, load, part.carried)
+        difference = after - before
+        out[block][:, :, smooth] = difference[:, :, task.columns[smooth]]
     return out
 
 
 def _packed(problem: IdentificationProblem, iteration: _Round, noise: np.ndarray) -> LinearFit:
     """Return the fit of the last round; its covariance allows for residuals correlated in time."""
-    plain = wls(problem.pooled, np.sqrt(noise))
+    std = np.sqrt(noise)
+    plain = wls(problem.pooled, std)
     p = len(iteration.values)
     rows = int(problem.pooled.rows.sum())
     meat = sum(scatter(white, residual) for white, residual in zip(iteration.white, iteration.residual))
     covariance = rows / (rows - p) * iteration.bread @ meat @ iteration.bread.T
     estimate = replace(plain.estimate, values=iteration.values, covariance=covariance, residual_std=1.0)
-    return LinearFit(estimate, np.sqrt(noise), *condition_numbers(np.concatenate(iteration.white).reshape(-1, p)))
+    whitened = np.concatenate(iteration.white).reshape(-1, p)
+    return LinearFit(estimate, np.sqrt(noise), *condition_numbers(whitened))
 
 
 ML = _MaximumLikelihood(

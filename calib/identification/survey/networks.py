@@ -77,7 +77,8 @@ def hopfield(
     bias = factor[:p, :p].T @ factor[:p, p]
     # of the sigmoid, as the survey's
     width = 5.0
-    step = rate * width / bound / np.linalg.norm(factor[:p, :p], 2) ** 2
+    largest = np.linalg.norm(factor[:p, :p], 2)
+    step = rate * width / bound / largest**2
     u = width * np.arctanh(np.asarray(start) / bound)
     x = np.asarray(start, dtype=float)
     count = 0
@@ -149,7 +150,9 @@ class _Hopfield(_Network):
         largest = float(np.abs(start).max())
         # without start values: what the weakest column needs to explain all torques
         if not largest:
-            needed = np.linalg.norm(factor[:-1, -1]) / np.linalg.norm(factor[:-1, :-1], axis=0)
+            target_norm = np.linalg.norm(factor[:-1, -1])
+            column_norms = np.linalg.norm(factor[:-1, :-1], axis=0)
+            needed = target_norm / column_norms
             largest = float(needed.max())
         return hopfield(factor, start, 1.5 * largest, self.rate, self.steps)
 
@@ -158,7 +161,8 @@ def _off(fit: LinearFit, values: np.ndarray, group_std: np.ndarray) -> LinearFit
     """Return a fit moved to other values, by the distance less certain."""
     away = values - fit.estimate.values
     covariance = fit.estimate.covariance + np.outer(away, away)
-    return replace(fit, estimate=replace(fit.estimate, values=values, covariance=covariance), group_std=group_std)
+    estimate = replace(fit.estimate, values=values, covariance=covariance)
+    return replace(fit, estimate=estimate, group_std=group_std)
 
 
 _LIKE_OLS = "the torques of all joints are equally noisy; q, v and a exact; enough steps"

@@ -79,7 +79,8 @@ class _OutputError(Method):
             return replace(plain, method=self.name)
         # of the differences of a robot without tangents, in standard deviations (our choice)
         step = 0.01
-        robot = believed_robot(problem, self, step * np.asarray(plain.estimate.sigma))
+        steps = step * np.asarray(plain.estimate.sigma)
+        robot = believed_robot(problem, self, steps)
         loops = close_loops(robot.model, problem.cases, problem.decimator, problem.loop, problem.cad)
         task = _Comparison(problem, robot, loops, self.torques)
         return attempted_in_loop(self.name, problem, loops, lambda: self._estimate(problem, plain, task))
@@ -111,6 +112,7 @@ class _OutputError(Method):
         step = np.linalg.norm(_gradient(residual / std, slopes / std[:, None]))
         if not solution.status.good and step > 0.5:
             raise NotConverged(f"{self.name}: {solution.status.value} ({step:.2g} standard deviations from rest)", fit)
+        simulations = task.count[0]
         return replace(
             plain,
             method=self.name,
@@ -118,7 +120,7 @@ class _OutputError(Method):
             solution=fit,
             std=std if self.torques else plain.std,
             iterations=count,
-            simulations=task.count[0],
+            simulations=simulations,
             beforehand=None,
             alone=True,
         )
@@ -150,7 +152,8 @@ class _Comparison:
             inertia: (n,) that the motors start with [kg m² or kg]; they start without friction.
         """
         motors = np.zeros(len(self.robot.columns) - len(values))
-        motors[:: max(1, len(motors) // len(inertia))] = inertia[: len(motors)]
+        stride = max(1, len(motors) // len(inertia))
+        motors[::stride] = inertia[: len(motors)]
         return np.append(values, motors)
 
     def simulated(self, values: np.ndarray) -> None:
@@ -159,7 +162,8 @@ class _Comparison:
             plant = self.robot.at(values, case)
             controller = loop.controller
             if loop.design is not None:
-                controller = controller.scaled(plant.inertia_diagonal(loop.reference.q[::200]) / loop.design)
+                diagonal = plant.inertia_diagonal(loop.reference.q[::200])
+                controller = controller.scaled(diagonal / loop.design)
             self.count[0] += 1
             plant.run(controller, loop.reference, Sensing(every=loop.every))
 
@@ -189,13 +193,17 @@ class _Comparison:
                 parts.append((motion.q - position, slope))
             elif self.rows.projection is not None:
                 torques = np.dstack([run.torque, run.by_torque])[index]
-                observed = self.rows.observe(torques, [BODIES] * torques.shape[2], motion.q, motion.v)
-                parts.append((case.target - observed[:, :, 0], observed[:, :, 1:]))
+                acts = [BODIES] * torques.shape[2]
+                observed = self.rows.observe(torques, acts, motion.q, motion.v)
+                residual = case.target - observed[:, :, 0]
+                parts.append((residual, observed[:, :, 1:]))
             elif self.rows.with_motors:
-                parts.append((case.target[:, -motion.n :] - run.torque[index], run.by_torque[index]))
+                measured_torque = case.target[:, -motion.n :]
+                parts.append((measured_torque - run.torque[index], run.by_torque[index]))
             residual = np.concatenate([part_residual for part_residual, _ in parts], axis=1)
             slope = np.concatenate([part_slope for _, part_slope in parts], axis=1)
-            joints = np.arange(residual.shape[1]) % min(motion.n, case.present.shape[1])
+            joint_count = min(motion.n, case.present.shape[1])
+            joints = np.arange(residual.shape[1]) % joint_count
             present = case.present[:, joints]
             in_use = thinned(present, motion.segment, self.problem.decimator)
             residual = decimate(residual, self.problem.decimator, motion.segment)
@@ -238,7 +246,8 @@ class _Comparison:
             residual, slopes = self.linearised(values)
         except CalibError:
             return np.full(p + 1, impossible), np.zeros((p + 1, p))
-        return (residual / std).ravel(), np.asfortranarray((slopes / std[:, None]).reshape(-1, p))
+        scaled_slopes = (slopes / std[:, None]).reshape(-1, p)
+        return (residual / std).ravel(), np.asfortranarray(scaled_slopes)
 
     def solved(self, values: np.ndarray, std: np.ndarray) -> nonlinear.Solution[np.ndarray]:
         """Return the parameters that minimise the residuals divided by std (r,)."""
@@ -277,7 +286,9 @@ class _Comparison:
 def _gradient(residual: np.ndarray, slopes: np.ndarray) -> np.ndarray:
     """Return the next Gauss–Newton step Qᵀ r (p,), in standard deviations of white residuals."""
     p = slopes.shape[2]
-    return np.linalg.qr(slopes.reshape(-1, p))[0].T @ residual.ravel()
+    flat = slopes.reshape(-1, p)
+    orthonormal, _ = np.linalg.qr(flat)
+    return orthonormal.T @ residual.ravel()
 
 
 def _packed(
@@ -304,7 +315,8 @@ def _packed(
     names = (*plain.pooled.names, *[term.name for term in motor_terms])
     flat = white.reshape(-1, p)
     size = np.linalg.norm(flat, axis=0)
-    factor = np.asarray(np.linalg.qr(flat / np.where(size > 0.0, size, 1.0), mode="r"))
+    safe_size = np.where(size > 0.0, size, 1.0)
+    factor = np.asarray(np.linalg.qr(flat / safe_size, mode="r"))
     require_rank(factor, names, "the simulated motion does not distinguish them")
     inverse = scipy.linalg.solve_triangular(factor, np.eye(p)) / size[:, None]
     bread = inverse @ inverse.T

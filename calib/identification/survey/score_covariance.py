@@ -20,7 +20,8 @@ def scatter(white: np.ndarray, residual: np.ndarray, covariance: np.ndarray | No
         covariance: C (p, p) of the estimate behind the residuals: σ_j² and ρ_j are then those of r and of what the fit
             took out, E[e_k e_l] = r_k r_l + w_k C w_lᵀ; on a short record least of all is left where W is large.
     """
-    white = shaped(white, (None, None, None), "rows")
+    shape = (None, None, None)
+    white = shaped(white, shape, "rows")
     residual = shaped(residual, white.shape[:2], "residuals")
     count = len(white)
     p = white.shape[2]
@@ -40,9 +41,12 @@ def scatter(white: np.ndarray, residual: np.ndarray, covariance: np.ndarray | No
             result += variance * values.T @ values
             continue
         lags = int(min(count // 4, max(min_lags, 15 * inflation(row_residuals))))
-        rho = autocorrelation(row_residuals, lags) * (1.0 - np.arange(1, lags + 1) / (lags + 1.0))
+        taper = 1.0 - np.arange(1, lags + 1) / (lags + 1.0)
+        rho = autocorrelation(row_residuals, lags) * taper
         kernel = np.zeros(size)
-        kernel[0], kernel[1 : lags + 1], kernel[size - lags :] = 1.0, rho, rho[::-1]
+        kernel[0] = 1.0
+        kernel[1 : lags + 1] = rho
+        kernel[size - lags :] = rho[::-1]
         gain = np.fft.rfft(kernel).real
         spectrum = np.fft.rfft(values, size, axis=0) * gain[:, None]
         smooth = np.fft.irfft(spectrum, size, axis=0)[:count]

@@ -121,7 +121,9 @@ def simulate_tangents(
     if not np.abs(slopes[:, -1]).max(initial=0.0) < max_slope:
         raise Diverged(f"the loop is unstable, its derivatives diverge: {LOWER}", None)
     t = reference.t[0] + tick * reference.period
-    return Sensitivities(t, *(frozen(x) for x in out), *(frozen(x) for x in slopes))
+    run = [frozen(values) for values in out]
+    run_slopes = [frozen(values) for values in slopes]
+    return Sensitivities(t, *run, *run_slopes)
 
 
 def simulate_differences(
@@ -148,8 +150,10 @@ def simulate_differences(
     shifts = np.eye(len(values))[columns] * steps[:, None]
     differences = [(moved(values + shift) - nominal) / step for shift, step in zip(shifts, steps)]
     slopes = np.stack(differences, axis=-1)
-    tick = sample_ticks(len(reference.t), every)
-    return Sensitivities(reference.t[0] + tick * reference.period, *map(frozen, (*nominal, *slopes)))
+    count = len(reference.t)
+    tick = sample_ticks(count, every)
+    t = reference.t[0] + tick * reference.period
+    return Sensitivities(t, *map(frozen, (*nominal, *slopes)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +176,9 @@ class Stepper:
         """
         from calib.identification.closed_loop import loop_kernels
 
-        q, v, gain = np.array(q), np.array(v), np.empty((q.shape[1], q.shape[1]))
+        q = np.array(q)
+        v = np.array(v)
+        gain = np.empty((q.shape[1], q.shape[1]))
         order, entries, shares, owners, _ = self.layout
         where = (order, entries, shares, owners, np.ascontiguousarray(parameters), q, v, tau, period, gain)
         status, reached = loop_kernels.advance_points(*self.parts, *where)
@@ -202,8 +208,11 @@ class Stepper:
 def stepper(plant: Plant, columns: np.ndarray) -> Stepper:
     """Return the stepper of a robot, with derivatives with respect to the parameters `columns` (c,)."""
     find = np.full(len(plant.parameters), -1)
-    find[np.asarray(columns, dtype=int)] = 2 * plant.bodies.n + np.arange(len(columns))
-    return Stepper(packed(plant), (*layout_of(plant), find))
+    numbers = 2 * plant.bodies.n + np.arange(len(columns))
+    find[np.asarray(columns, dtype=int)] = numbers
+    parts = packed(plant)
+    layout = (*layout_of(plant), find)
+    return Stepper(parts, layout)
 
 
 # shares of least squares, the rest being a regular robot, that are tried until one can be simulated
@@ -253,7 +262,8 @@ class BelievedRobot:
         carried = self.carried(case)
         by_q = sensitivities.by_q * carried
         by_v = sensitivities.by_v * carried
-        return replace(sensitivities, by_q=by_q, by_v=by_v, by_torque=sensitivities.by_torque * carried)
+        by_torque = sensitivities.by_torque * carried
+        return replace(sensitivities, by_q=by_q, by_v=by_v, by_torque=by_torque)
 
     def carried(self, case: Case) -> np.ndarray:
         """Return a factor (p,) per parameter of a serial arm: 0 for payloads not attached in a case, otherwise 1."""
@@ -289,18 +299,27 @@ def believed_robot(problem: IdentificationProblem, method: Method, steps: np.nda
     """
     if steps is not None and not isinstance(problem.model, IdentificationModel):
         columns = np.array(problem.base.kept)
-        return BelievedRobot(problem.model, columns, plant_of(problem.model, np.zeros(problem.model.p)), steps)
+        values = np.zeros(problem.model.p)
+        plant = plant_of(problem.model, values)
+        return BelievedRobot(problem.model, columns, plant, steps)
     model, columns = with_friction(problem, serial_arm(problem, method))
     terms = model.columns
     size = model.p
     if not model.torque_rows.with_motors:
-        widths = {term.acts[0][0]: term.settings[-1] for term in terms if term.shape == "sign"}
+        widths = {}
+        for term in terms:
+            if term.shape == "sign":
+                joint = term.acts[0][0]
+                widths[joint] = term.settings[-1]
         width = [widths.get(joint, V0) for joint in range(model.n)]
-        motors = standard(["Ia Fvm Fcm offm"] * model.n, width, model.prismatic.tolist())
+        sets = ["Ia Fvm Fcm offm"] * model.n
+        linear = model.prismatic.tolist()
+        motors = standard(sets, width, linear)
         terms = (*terms, *(replace(motor, name=f"motor {motor.name}") for motor in motors))
         columns = np.append(columns, np.arange(size, size + len(motors)))
     with refused_as(CannotSimulate, CalibError, "{}"):
-        plant = Plant(model.bodies, terms, np.zeros(model.inertial + len(terms)))
+        parameters = np.zeros(model.inertial + len(terms))
+        plant = Plant(model.bodies, terms, parameters)
     return BelievedRobot(model, columns, plant)
 
 
@@ -308,7 +327,8 @@ def with_friction(problem: IdentificationProblem, model: IdentificationModel) ->
     """Return a problem's model with all friction terms, and the index (p,) of each parameter in it."""
     extra = [term for term in problem.terms[problem.base.b :] if term is not None]
     model = model.with_terms(*extra)
-    columns = [*problem.base.kept, *range(model.p - len(extra), model.p)]
+    extra_columns = range(model.p - len(extra), model.p)
+    columns = [*problem.base.kept, *extra_columns]
     return model, np.array(columns, dtype=int)
 
 
@@ -339,7 +359,8 @@ def start_of(
             standard[motors[joint]] = own_inertia
     regular = np.append(problem.base.transform @ standard, np.zeros(len(plain) - base_count))
     if serial and not np.any(standard):
-        regular = np.append(problem.base.transform @ _hubs(model, inertia), np.zeros(len(plain) - base_count))
+        base_values = problem.base.transform @ _hubs(model, inertia)
+        regular = np.append(base_values, np.zeros(len(plain) - base_count))
     failure: CalibError | None = None
     for share in SHARES:
         values = share * plain + (1.0 - share) * regular

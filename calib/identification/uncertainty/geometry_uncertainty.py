@@ -93,9 +93,11 @@ def estimator(identification: Identification[RegressorModel]) -> _Estimator:
     deviation = np.array(fitted.std) if fitted.weighted else np.ones(len(fitted.std))
     prior_rows = fitted.beforehand
     if prior_rows is None:
-        return _Estimator(deviation, np.zeros((0, p)), np.zeros(p))
+        beforehand = np.zeros((0, p))
+        return _Estimator(deviation, beforehand, np.zeros(p))
     deviation = deviation * np.sqrt(fitted.inflation)
-    factors = (fitted.pooled.factors / deviation[:, None, None]).reshape(-1, p + 1)
+    weighted = fitted.pooled.factors / deviation[:, None, None]
+    factors = weighted.reshape(-1, p + 1)
     matrix = factors[:, :p]
     target = factors[:, p]
     values = fitted.estimate.values
@@ -106,12 +108,14 @@ def estimator(identification: Identification[RegressorModel]) -> _Estimator:
 def estimate(estimator: _Estimator, all_rows: Sequence[ObservationRows]) -> tuple[np.ndarray, np.ndarray]:
     """Return φ (p,) from rows, and A⁻¹ (p, p); by QR of the whitened rows."""
     p = len(estimator.pull)
-    factor = np.hstack([estimator.beforehand, np.zeros((len(estimator.beforehand), 1))])
+    no_target = np.zeros((len(estimator.beforehand), 1))
+    factor = np.hstack([estimator.beforehand, no_target])
     for rows in all_rows:
         augmented = np.column_stack([stacked(rows), rows.target.ravel()])
         whitened = augmented * weights(estimator, rows)[:, None]
         factor = retriangulate(np.vstack([factor, whitened]))
-    inverse = inverted(factor[:p, :p])
+    upper = factor[:p, :p]
+    inverse = inverted(upper)
     solution = factor[:p, p]
     return inverse @ (solution + inverse.T @ estimator.pull), inverse @ inverse.T
 
@@ -134,22 +138,30 @@ def rows_on(identification: Identification, chain: Chain, cases: Sequence[Case])
 
 def cut(rows: ObservationRows, part: slice) -> ObservationRows:
     """Return the part of the rows in a slice."""
+    matrix = rows.matrix[part]
+    target = rows.target[part]
+    present = rows.present[part]
+    block = rows.block[part]
+    standing = rows.standing[part]
+    swing = rows.swing[part]
+    breakaway = rows.breakaway[part]
     return replace(
         rows,
-        matrix=rows.matrix[part],
-        target=rows.target[part],
-        present=rows.present[part],
-        block=rows.block[part],
-        standing=rows.standing[part],
-        swing=rows.swing[part],
-        breakaway=rows.breakaway[part],
+        matrix=matrix,
+        target=target,
+        present=present,
+        block=block,
+        standing=standing,
+        swing=swing,
+        breakaway=breakaway,
     )
 
 
 def inverted(upper: np.ndarray) -> np.ndarray:
     """Return the inverse of an upper triangular matrix (p, p) whose columns have different units."""
     unit = np.linalg.norm(upper, axis=0)
-    inverse = np.asarray(scipy.linalg.solve_triangular(upper / unit, np.eye(len(unit))))
+    identity = np.eye(len(unit))
+    inverse = np.asarray(scipy.linalg.solve_triangular(upper / unit, identity))
     return inverse / unit[:, None]
 
 
@@ -256,10 +268,12 @@ def propagate(
         geometry = frozen(by_geometry @ covariance @ by_geometry.T)
         element_deviations = np.sqrt(np.clip(np.diag(covariance)[:element_count], 0.0, None))
         deviations[:element_count] = np.where(element_deviations > 0.0, element_deviations, np.nan)
+    elements = (*chain.names, *TILTS)
+    units = (*chain.units, *(["rad"] * len(TILTS)))
     return GeometryUncertainty(
         names=identification.names,
-        elements=(*chain.names, *TILTS),
-        units=(*chain.units, *(["rad"] * len(TILTS))),
+        elements=elements,
+        units=units,
         sensitivity=matrix,
         torque=identification.fitted.estimate.covariance,
         deviations=deviations,
@@ -279,7 +293,8 @@ def sensitivity(
     if not identification.dynamics.model.torque_rows.has_bodies:
         # Without bodies, no geometry affects the rows.
         count = len(chain.elements) + len(TILTS)
-        return np.zeros((len(identification.names), count)), np.zeros(count), np.zeros(count)
+        no_sensitivity = np.zeros((len(identification.names), count))
+        return no_sensitivity, np.zeros(count), np.zeros(count)
     differences = partial(_differences, identification, _neighbours(identification, chain))
     return solve_sensitivity(identification, cases, differences, SAMPLES, progress)
 
@@ -343,7 +358,8 @@ def solve_sensitivity(
         augmented = np.hstack([np.concatenate(instruments), matrix, change])
         factor = retriangulate(augmented * scale[:, None])[:p, p:]
         unit = np.linalg.norm(factor[:, :p], axis=0)
-        scaled_slopes = -np.linalg.solve(factor[:, :p] / unit, factor[:, p:])
+        scaled_factor = factor[:, :p] / unit
+        scaled_slopes = -np.linalg.solve(scaled_factor, factor[:, p:])
         slopes = scaled_slopes / unit[:, None]
     else:
         # The prior counts as much beside the pieces as it did beside all rows.
@@ -352,8 +368,10 @@ def solve_sensitivity(
         prior_rows = np.sqrt(share) * np.pad(weighting.beforehand, padding)
         whitened = np.hstack([matrix, change]) * scale[:, None]
         factor = retriangulate(np.vstack([prior_rows, whitened]))
-        inverse = inverted(factor[:p, :p])
-        slopes = inverse @ (inverse[: identification.base.b].T @ pull - factor[:p, p:])
+        upper = factor[:p, :p]
+        inverse = inverted(upper)
+        base_rows = inverse[: identification.base.b]
+        slopes = inverse @ (base_rows.T @ pull - factor[:p, p:])
     used = scale > 0.0
     after = change + matrix @ slopes
     return slopes, _rms(change[used]), _rms(after[used])
@@ -420,7 +438,8 @@ def _differences(
     n = model.bodies.n
     inertial = model.inertial
     onboard = model.carried_columns(case.carried)
-    parameters = base.to_standard(identification.fitted.estimate.values[: base.b])[:inertial] * onboard
+    base_values = identification.fitted.estimate.values[: base.b]
+    parameters = base.to_standard(base_values)[:inertial] * onboard
     q, v, a = (np.asarray(series[span]) for series in case.links)
 
     # The residuals as torques of the joints at the full rate.
@@ -429,7 +448,8 @@ def _differences(
     if torque_rows.projection is not None:
         # No geometry changes the projection.
         joint_residual = np.einsum("nrk,nrc->nkc", torque_rows.projection.torques(q, v), joint_residual)
-    joint_residual = replace(torque_rows, projection=None).fold(joint_residual, (BODIES,))[:, :, 0]
+    unprojected = replace(torque_rows, projection=None)
+    joint_residual = unprojected.fold(joint_residual, (BODIES,))[:, :, 0]
 
     change = np.zeros((len(pairs), n, len(q)))
     pull = np.zeros((inertial, len(pairs)))
@@ -444,7 +464,8 @@ def _differences(
                 rigid_body.fill_regressor(bodies, q[part], v[part], a[part], out)
                 change[k, :, part] += factor * (parameters @ regressor).reshape(n, -1)
                 pull[:, k] += factor * (regressor @ block_residual)
-    rows = torque_rows.observe(change.transpose(2, 1, 0), (BODIES,) * len(pairs), q, v)
+    acts = (BODIES,) * len(pairs)
+    rows = torque_rows.observe(change.transpose(2, 1, 0), acts, q, v)
     of_bodies = base.kept < inertial
     base_pull = np.zeros((base.b, len(pairs)))
     base_pull[of_bodies] = (pull * onboard[:, None])[base.kept[of_bodies]]
@@ -504,19 +525,17 @@ def compare(
     for nominal_part, calibrated_part in zip(nominal_rows, identification.rows):
         for start in range(0, len(nominal_part.target), CHUNK):
             chunk = slice(start, start + CHUNK)
-            nominal_gain = _gain(nominal_inverse, weighting, cut(nominal_part, chunk))
+            rows = cut(nominal_part, chunk)
+            nominal_gain = _gain(nominal_inverse, weighting, rows)
             calibrated_gain = _gain(calibrated_inverse, weighting, cut(calibrated_part, chunk))
             row_noise = np.tile(noise, len(nominal_part.target[chunk]))
             variance += np.sum((nominal_gain * row_noise) ** 2, axis=1)
             difference_variance += np.sum(((nominal_gain - calibrated_gain) * row_noise) ** 2, axis=1)
     values = np.asarray(fitted.estimate.values)
-    return GeometryComparison(
-        identification.names,
-        fitted.estimate.units,
-        frozen(np.stack([values + nominal_values - calibrated_values, values])),
-        frozen(np.stack([np.sqrt(variance), uncertainty.sigma])),
-        frozen(np.sqrt(difference_variance)),
-    )
+    sigma = frozen(np.stack([np.sqrt(variance), uncertainty.sigma]))
+    difference = frozen(np.sqrt(difference_variance))
+    values_of_both = frozen(np.stack([values + nominal_values - calibrated_values, values]))
+    return GeometryComparison(identification.names, fitted.estimate.units, values_of_both, sigma, difference)
 
 
 def _gain(inverse: np.ndarray, weighting: _Estimator, rows: ObservationRows) -> np.ndarray:
@@ -541,7 +560,8 @@ def deflection_sensitivity(found: Identification, robot: CalibratedChain, cases:
     inverse = estimate(how, found.rows)[1]
     decimator = common_decimator(cases, found.settings)
     model = found.dynamics.model
-    standard = found.base.to_standard(found.fitted.estimate.values[: found.base.b])[: model.inertial]
+    base_values = found.fitted.estimate.values[: found.base.b]
+    standard = found.base.to_standard(base_values)[: model.inertial]
     pull = np.zeros((len(inverse), len(terms.terms)))
     seen = 0
     every = -(-sum(len(case.motion) for case in cases) // DEFLECTION_SAMPLES)
@@ -551,17 +571,22 @@ def deflection_sensitivity(found: Identification, robot: CalibratedChain, cases:
         spans = []
         for chosen, span in pieces(case, decimator, every):
             part = cut(rows, chosen)
-            white = part.matrix * (weights(how, part) ** 2).reshape(part.present.shape)[:, :, None]
+            squared = (weights(how, part) ** 2).reshape(part.present.shape)
+            white = part.matrix * squared[:, :, None]
             back = spread(white, decimator, span.stop - span.start)
-            spans.append((span, model.torque_rows.fold(back, (BODIES,) * back.shape[2])))
+            acts = (BODIES,) * back.shape[2]
+            spans.append((span, model.torque_rows.fold(back, acts)))
             seen += np.count_nonzero(part.present)
         for j in np.flatnonzero(np.isin(chain.moving, where)):
             own = where == chain.moving[j]
             bases = motion_of_bases(chosen_terms(terms, own), case.motion, torque)
             for span, felt in spans:
-                slopes = _torque_slopes(model.bodies, values, [x[span] for x in case.links], int(j))
+                link_motion = [x[span] for x in case.links]
+                joint = int(j)
+                slopes = _torque_slopes(model.bodies, values, link_motion, joint)
                 pull[:, own] += np.einsum("nip,sni,sen->pe", felt, slopes, bases[:, :, span], optimize=True)
-    return -inverse @ pull * (sum(np.count_nonzero(part.present) for part in found.rows) / seen)
+    row_count = sum(np.count_nonzero(part.present) for part in found.rows)
+    return -inverse @ pull * (row_count / seen)
 
 
 def _torque_slopes(bodies: Bodies, values: np.ndarray, states: Sequence[np.ndarray], joint: int) -> np.ndarray:

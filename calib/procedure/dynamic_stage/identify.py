@@ -21,6 +21,7 @@ from calib.identification.physical_consistency.solve import Contradiction, contr
 from calib.identification.prediction import Dynamics, Score, predict, score
 from calib.identification.rows import Case
 from calib.identification.uncertainty import geometry_uncertainty, torque_errors
+from calib.identification.uncertainty.learned_torque_errors import learn_torque_errors
 from calib.procedure.dynamic_stage import plain, plausibility
 from calib.procedure.dynamic_stage import verdict as judging
 from calib.procedure.dynamic_stage.hypotheses import gravity_hypotheses
@@ -304,7 +305,7 @@ def judged(
     wrong = driven(found.dynamics, inputs.cases)
     carried, geometries = _carry(inputs, found, say)
     say("errors on held-out time")
-    errors = torque_errors.learn_torque_errors(found, inputs.cases, carried.covariance)
+    errors = learn_torque_errors(found, inputs.cases, carried.covariance)
     findings = ModelFindings(
         rests=judging.resting_parameters(found),
         noticed=judging.model_findings(inputs.cases, found),

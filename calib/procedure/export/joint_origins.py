@@ -11,7 +11,6 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.config_types import ParsedTable
 from calib.errors import refuse_robot
 from calib.robot.formats.urdf_tree import read as read_tree
 
@@ -19,7 +18,7 @@ _PLAIN = re.compile(r"[A-Za-z_][\w./-]*", re.ASCII)
 _WORDS = {"yes", "no", "on", "off", "true", "false", "null"}  # no texts in YAML 1.1, in any case
 
 
-def block(value: ParsedTable, indent: str = "") -> str:
+def block(value: Mapping[str, object], indent: str = "") -> str:
     """Return the YAML lines of a mapping from texts to mappings, texts and finite floats."""
     lines = []
     for key, item in value.items():

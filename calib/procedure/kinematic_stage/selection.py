@@ -101,7 +101,7 @@ class Chosen:
         return self.outlook.poses
 
     @property
-    def figures(self) -> tuple[str, ...]:
+    def figure_names(self) -> tuple[str, ...]:
         """Names of the available figures; none if a parameter is not identifiable."""
         if self.prediction is None:
             return ()
@@ -313,7 +313,7 @@ def beside_poses(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[s
         paths["prediction"] = forecast.beside(out)
     figures = ()
     if plots:
-        figures = FIGURES if chosen is None else chosen.figures
+        figures = FIGURES if chosen is None else chosen.figure_names
     for name in figures:
         paths[name] = out.parent / f"{out.stem}_{name}.png"
     return paths

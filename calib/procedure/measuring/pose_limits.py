@@ -29,11 +29,11 @@ from calib.procedure.measuring.moveit import limit_tables
 from calib.procedure.measuring.sight import SeenOnly, Sight, sight_of
 from calib.records import FieldValues
 from calib.robot.beside import links_of
-from calib.robot.capsules import Obstacle, Wall, signed_distance
 from calib.robot.chain import Chain
 from calib.robot.description import MAX_TURN, remarks
 from calib.robot.formats.urdf_tree import is_urdf, text
 from calib.robot.formats.urdf_tree import read as read_tree
+from calib.robot.obstacles import Obstacle, Wall, signed_distance
 from calib.robot.tables import load as load_table
 from calib.robot.tables import placement
 

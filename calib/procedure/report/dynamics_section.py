@@ -29,7 +29,7 @@ from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.metrics import ModelMetrics, UnseenReport
 from calib.procedure.dynamic_stage.metrics import metrics as record_of
-from calib.procedure.findings import lines_of
+from calib.procedure.findings import as_notes, lines_of
 from calib.procedure.report import page
 from calib.records import read_rows
 from calib.robot.chain import Chain
@@ -208,7 +208,8 @@ def report_section(
         blocks.append(page.Text("Closed loop", _loop_sentences(metrics.loop)))
     blocks += tracking_blocks(unseen.tracking, unseen.tracking_failure)
     blocks.append(page.Text("What was exported", exported))
-    blocks.append(page.Text("Notes on the dynamics", warnings_of(report), "note"))
+    noticed = (*report.metrics.noticed, *report.unseen.noticed)
+    blocks.append(page.Text("Notes on the dynamics", as_notes(warnings_of(report), noticed), "note"))
     key_figures = _key_figures(unseen, tolerance, delivered)
     return page.Section("Dynamics", blocks, unseen.verdict, unseen.reason, key_figures)
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from calib.geometry.accuracy import ErrorStatistics, rms_sigma
 from calib.geometry.repeatability import RepeatedPose
+from calib.procedure.findings import as_notes
 from calib.procedure.kinematic_stage.comparison import iso9283_sentence
 from calib.procedure.kinematic_stage.inputs import Inputs
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics, Outlier
@@ -76,7 +77,7 @@ def outcome_section(metrics: FitMetrics) -> page.Section:
         blocks.append(page.Text("", [metrics.advice], "what to do"))
     blocks.append(page.Text("", _repeated_sentences(metrics)))
     blocks.append(page.Text("", outlier_sentences(metrics), "outliers"))
-    blocks.append(page.Text("", metrics.warnings, "note"))
+    blocks.append(page.Text("", as_notes(metrics.warnings, metrics.noticed), "note"))
     blocks.append(page.Text("", metrics.not_identifiable, "identifiability"))
     return page.Section("Geometry", blocks, metrics.verdict, metrics.reason)
 

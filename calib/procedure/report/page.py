@@ -12,7 +12,7 @@ from rich.console import RenderableType
 from rich.table import Table as RichTable
 from rich.text import Text as RichText
 
-from calib.procedure.findings import LEVELS, Warned
+from calib.procedure.findings import LEVELS, Note
 
 # name, what it is, bytes, SHA-256
 FileRow = tuple[str, str, str, str]
@@ -113,10 +113,10 @@ def shortened(text: str, max_letters: int) -> str:
 
 @dataclass(frozen=True)
 class Text:
-    """A list of sentences; on the console, `label` is printed before each."""
+    """A list of sentences; on the console, `label` is printed before each, or that it is a warning."""
 
     title: str
-    lines: Sequence[str]
+    lines: Sequence[str | Note]
     label: str = ""
     kind: str = "text"
 
@@ -212,12 +212,14 @@ def rendered(blocks: Iterable[Block]) -> Iterator[RenderableType]:
             yield _rich_table(block)
         elif isinstance(block, Text):
             for line in block.lines:
-                label = "warning" if isinstance(line, Warned) else block.label
+                label = block.label
+                if isinstance(line, Note) and line.is_warning:
+                    label = "warning"
                 printed = RichText()
                 if label:
                     printed.append(label, "yellow")
                     printed.append(": ")
-                yield printed.append(single_colons(line))
+                yield printed.append(single_colons(str(line)))
 
 
 def single_colons(line: str) -> str:

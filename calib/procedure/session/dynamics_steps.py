@@ -33,7 +33,7 @@ from calib.procedure.dynamic_stage.identify import DynamicsAssessment, assess
 from calib.procedure.excitation import coefficients, prediction
 from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.excitation.settings import ExcitationSettings
-from calib.procedure.findings import UNJUDGED, Verdict, lines_of
+from calib.procedure.findings import UNJUDGED, Note, Verdict, as_notes, lines_of
 from calib.procedure.robot_kinds import joints_of
 from calib.procedure.session.folder import CUTS, MOTION_CHECKED, ROUND, Say, Session
 from calib.procedure.session.masses import return_masses
@@ -353,7 +353,7 @@ def _gathered(
     )
 
 
-def identify(session: Session, say: Say) -> list[str]:
+def identify(session: Session, say: Say) -> list[str | Note]:
     """Identify base parameters and friction on the calibrated geometry; validation files are not used."""
     from calib.procedure.dynamic_stage import folder as identification_outputs
     from calib.procedure.report.outputs import write_model
@@ -371,7 +371,7 @@ def identify(session: Session, say: Say) -> list[str]:
     raw, normalised = identification.condition
     friction = identification.friction.chosen or "standard"
     score = next(iter(outcome.fit.values()))
-    notes = [
+    notes: list[str | Note] = [
         f"{len(identification.names)} parameters by {identification.fitted.method}, friction {friction}, condition "
         f"number {raw:.3g}, with unit columns {normalised:.3g}; {score.judged.total:.2f} % of the torque unexplained"
     ]
@@ -384,11 +384,12 @@ def identify(session: Session, say: Say) -> list[str]:
     notes += return_masses(session)
     # `predict` judges on unseen motion
     later = lines_of([warning for warning in outcome.noticed if warning.code == "no-unseen-motion"])
-    notes += [warning for warning in outcome.warnings if warning not in later]
+    warnings = [warning for warning in outcome.warnings if warning not in later]
+    notes += as_notes(warnings, outcome.noticed)
     return notes
 
 
-def predict(session: Session, say: Say) -> list[str]:
+def predict(session: Session, say: Say) -> list[str | Note]:
     """Validate the identified model on unseen motion, and write the verdict."""
     training, held_out = _divided(session)
     unseen = session.brought("unseen")
@@ -407,7 +408,7 @@ def predict(session: Session, say: Say) -> list[str]:
     folder.unseen.write(gathered, assessment)
     earlier = folder.metrics().warnings
     new_warnings = [warning for warning in assessment.warnings if warning not in earlier]
-    return [*notes, str(assessment.verdict), *new_warnings]
+    return [*notes, str(assessment.verdict), *as_notes(new_warnings, assessment.noticed)]
 
 
 def _as_delivered(session: Session, assessment: DynamicsAssessment) -> Verdict:

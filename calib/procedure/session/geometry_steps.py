@@ -35,7 +35,7 @@ from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets
 from calib.identification.model_file import MODEL
 from calib.poses.candidates import draw_candidates
 from calib.poses.space import is_feasible
-from calib.procedure.findings import UNJUDGED, Warned, lines_of
+from calib.procedure.findings import UNJUDGED, Note, as_notes, notes_of
 from calib.procedure.kinematic_stage import fit as fitting
 from calib.procedure.kinematic_stage import folder as outputs
 from calib.procedure.kinematic_stage import inputs, selection
@@ -230,7 +230,7 @@ def select(session: Session, say: Say) -> list[str]:
     return _choose(session, chain, say)
 
 
-def arrive(session: Session, say: Say) -> list[str]:
+def arrive(session: Session, say: Say) -> list[Note]:
     """Check the measured files for the fit, and return notes."""
     chain = chain_of(session)
     blocks = read_measured(session, chain, session.brought("measured"))
@@ -238,8 +238,9 @@ def arrive(session: Session, say: Say) -> list[str]:
     notes = notes_on(session, chain, blocks, folder.POSES)
     measured = [block for _, block in blocks]
     measured_later = [block for _, block in repeated]
-    notes += lines_of(drift.of_session(session, chain, measured, measured_later))
-    files.write(session.path(folder.POSES_CHECKED), "\n".join(notes) + "\n")
+    notes += notes_of(drift.of_session(session, chain, measured, measured_later))
+    text = "\n".join(note.text for note in notes)
+    files.write(session.path(folder.POSES_CHECKED), text + "\n")
     return notes
 
 
@@ -258,14 +259,14 @@ def read_measured(
     return blocks
 
 
-def notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMeasurements]], plan: str) -> list[str]:
+def notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMeasurements]], plan: str) -> list[Note]:
     """Return the notes on measured blocks: rows, kind, ignored columns, poses missing from a list in ``2-poses``."""
     measures = session.settings.instrument.measures
     path = session.path(f"2-poses/{plan}")
     planned = None
     if session.settings.poses.plan and path.exists():
         planned = read_poses(path, Joints(chain.joint_names, joint_kinds(chain)))
-    notes = []
+    notes: list[Note] = []
     for name, block in blocks:
         ignored = f", ignored: {', '.join(block.ignored)}" if block.ignored else ""
         remarks = [f"{len(block)} rows of kind {block.kind}{ignored}"]
@@ -278,12 +279,12 @@ def notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMea
         remarks += block.notes
         if planned is not None:
             remarks += check_against(planned, block)
-            remarks += lines_of(readback(planned, block))
-        for remark in remarks:
-            note = f"{name}: {remark}"
-            notes.append(Warned(note) if isinstance(remark, Warned) else note)
+        notes += [Note(f"{name}: {remark}") for remark in remarks]
+        if planned is not None:
+            for note in notes_of(readback(planned, block)):
+                notes.append(Note(f"{name}: {note.text}", note.is_warning))
     if planned is not None:
-        notes += unmeasured(planned, [block for _, block in blocks])
+        notes += map(Note, unmeasured(planned, [block for _, block in blocks]))
     return notes
 
 
@@ -342,7 +343,7 @@ def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
     )
 
 
-def fit(session: Session, say: Say) -> list[str]:
+def fit(session: Session, say: Say) -> list[Note]:
     """Fit the geometry to the measured files; validation files are not used."""
     poses = session.path(f"2-poses/{folder.POSES}")
     predicted = None
@@ -355,15 +356,16 @@ def fit(session: Session, say: Say) -> list[str]:
     outputs.write_folder(outcome, session.fit.path, draw, owned=True)
 
     metrics = session.fit.metrics()
-    notes = [f"model {metrics.model}: {error_words(metrics)}; {parameter_words(metrics)}", *outcome.warnings]
+    notes = [Note(f"model {metrics.model}: {error_words(metrics)}; {parameter_words(metrics)}")]
+    notes += as_notes(outcome.warnings, outcome.assessment.noticed)
     for sentence in outlier_sentences(metrics):
         if outcome.selection.loss == "none":
             sentence += '; check these rows, or set loss = "cauchy" in session.toml'
-        notes.append(sentence)
+        notes.append(Note(sentence))
     return notes
 
 
-def validate(session: Session, say: Say) -> list[str]:
+def validate(session: Session, say: Say) -> list[Note]:
     """Validate the fitted robot on unseen poses, as `calib fit` does with validation files."""
     chain, unseen = chain_of(session), session.brought("validation")
     metrics, report = session.fit.metrics(), fit_report.read(session.fit.report)
@@ -385,7 +387,7 @@ def validate(session: Session, say: Say) -> list[str]:
     validation_metrics = session.validation.write(assessment, gathered, rows)
     fit_report.write(report.with_unseen(validation_metrics, rows), session.validation.report)
     new_warnings = [warning for warning in assessment.warnings if warning not in metrics.warnings]
-    return [*notes, str(assessment.verdict), *new_warnings]
+    return [*notes, Note(str(assessment.verdict)), *as_notes(new_warnings, assessment.noticed)]
 
 
 def export(session: Session, say: Say) -> list[str]:

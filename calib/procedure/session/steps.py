@@ -9,7 +9,7 @@ are kept and reported. A running step is marked; if its command was killed, the 
 import json
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
@@ -21,7 +21,7 @@ from calib.files import fingerprint
 from calib.folders import COVARIANCE, ESTIMATE, METRICS, REPORT
 from calib.identification.model_file import MODEL
 from calib.procedure.excitation.coefficients import NAME as MOTION
-from calib.procedure.findings import Warned
+from calib.procedure.findings import Note
 from calib.procedure.kinematic_stage.folder import URDF
 from calib.procedure.report.templates import versions
 from calib.procedure.session import dynamics_steps, folder, geometry_steps
@@ -141,7 +141,7 @@ class SessionStep:
 
     name: str
     purpose: str
-    make: Callable[[Session, Say], list[str]]
+    make: Callable[[Session, Say], Sequence[str | Note]]
     reads: tuple[Input, ...]
     makes: tuple[str, ...]
     settings: tuple[StepSetting, ...]
@@ -505,12 +505,14 @@ def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: 
         command=command,
         seed=session.settings.seed,
         toolkit=versions(),
-        notes=tuple(notes),
+        notes=tuple(str(note) for note in notes),
     )
     session.write_state(StateFile({**recorded.steps, step.name: record}))
     say(f"{number} {step.name}: {notes[0] if notes else 'done'}")
     for note in notes[1:]:
-        warning = "warning: " if isinstance(note, Warned) else ""
+        warning = ""
+        if isinstance(note, Note) and note.is_warning:
+            warning = "warning: "
         say(f"    {warning}{note}")
 
 

@@ -98,7 +98,8 @@ def test_what_cannot_be_compared_is_refused(fits, tmp_path):
 
 def test_what_makes_two_calibrations_hard_to_compare_is_said():
     """Combinations that one alone has, a failed one, another serial number, several parameters changed."""
-    fit = SimpleNamespace(cell=SimpleNamespace(deflection=SimpleNamespace(terms=())), left=1e-4, judged=("fail", "bad"))
+    cell = SimpleNamespace(deflection=SimpleNamespace(terms=()))
+    fit = SimpleNamespace(cell=cell, residual_rms=1e-4, judged=("fail", "bad"))
     one, two = (SimpleNamespace(**vars(fit), name=name, serial=name) for name in ("a", "b"))
     moved = SimpleNamespace(rms=1e-3, expected=1e-5)
     first = SimpleNamespace(name="joint_3.offset", alone=1e-3, alone_sigma=1e-5, unit="rad")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calib.errors import CannotSimulate, UsageError
-from calib.identification.closed_loop import instrumental
+from calib.identification.closed_loop import simulated_runs
 from calib.identification.closed_loop.simulation import Plant
 from calib.simulation import known_robots
 
@@ -14,14 +14,14 @@ def test_the_step_is_halved_until_the_loop_is_stable(
     monkeypatch: pytest.MonkeyPatch, stable: float, share: float
 ) -> None:
     start, end = step(monkeypatch, stable)
-    nearer, runs = instrumental._nearer(start, end, [])
-    assert runs == [] and nearer.parameters[0] == share
+    plant, runs = simulated_runs.nearer(start, end, [])
+    assert runs == [] and plant.parameters[0] == share
 
 
 def test_where_no_part_of_the_step_is_stable_that_is_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
     start, end = step(monkeypatch, 0.0)
     with pytest.raises(CannotSimulate, match="no robot on the way to the estimate can be simulated: unstable"):
-        instrumental._nearer(start, end, [])
+        simulated_runs.nearer(start, end, [])
 
 
 def step(monkeypatch: pytest.MonkeyPatch, stable: float) -> tuple[Plant, Plant]:
@@ -32,7 +32,7 @@ def step(monkeypatch: pytest.MonkeyPatch, stable: float) -> tuple[Plant, Plant]:
             raise UsageError("unstable")
         return []
 
-    monkeypatch.setattr(instrumental, "_runs", runs)
+    monkeypatch.setattr(simulated_runs, "simulated_runs", runs)
     plant = known_robots.plant("tx40", coupled=True)
     zero, one = np.zeros_like(plant.parameters), np.ones_like(plant.parameters)
     return plant.with_parameters(zero), plant.with_parameters(one)

@@ -271,7 +271,7 @@ def test_folders_and_words_that_do_not_serve_are_refused(fitted, here, calib):
     (here / "half" / "robot.toml").write_text((fitted / "robot.toml").read_text())
     for arguments, said in (
         (("empty", "t.csv"), "give the folder of a fit"),
-        (("half", "t.csv"), "covariance.csv"),
+        (("half", "t.csv"), "half is a robot; give the folder of a fit"),
         ((fitted, "none.csv"), "none.csv"),
         ((fitted, "t.csv", "--frame", "table"), "seen"),
         ((fitted, "t.csv", "--tool", "1,2"), "x,y,z"),

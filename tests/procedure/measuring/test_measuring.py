@@ -21,7 +21,7 @@ from calib.procedure.measuring.pose_limits import Limits, limits_of, read_limits
 from calib.procedure.measuring.prediction import predicted
 from calib.procedure.measuring.run import Exchange, RunSettings, drivable, plan_run, turns, write_run
 from calib.procedure.session.questions import cell_tables
-from calib.results.scene import is_run, rehearsed_samples
+from calib.results.scene_files import is_run, rehearsed_samples
 from calib.robot.chain import Chain, random_joints
 from calib.robot.library import load
 

@@ -13,8 +13,9 @@ from calib import cli
 from calib.apps.viewer import viewer
 from calib.errors import UsageError
 from calib.geometry import installation
-from calib.results import scene as viewing
-from calib.results.scene import visuals
+from calib.results import scene_files as viewing
+from calib.results.scene import thinned
+from calib.results.scene_files import visuals
 from calib.robot.formats import urdf_write
 from calib.robot.kinematics import forward
 from calib.robot.library import load
@@ -110,7 +111,7 @@ def test_a_session_plays_poses_motions_and_torques_on_one_clock(session, tmp_pat
     chunks = pytest.importorskip("rerun.chunk")
     scene = viewer.write(session, tmp_path / "s.rrd")
     found = rows(tmp_path / "s.rrd")
-    some = len(viewing.thinned(scene.played[0].t))
+    some = len(thinned(scene.played[0].t))
     assert some == 101  # 2 s at 50 Hz
     assert found["/world/chosen/poses"] == 7
     elbow = r"elbow_joint\ motor\ torque"

@@ -58,7 +58,7 @@ def test_a_failing_verdict_is_code_1(cells: Path) -> None:
 
 def test_an_unforeseen_error_stops_none_either(cells: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(steps, "run_next", lambda *given: 1 / 0)
-    one = fleet.run_one(cells / "a")
+    one = fleet.run_session(cells / "a")
     assert one.state == fleet.FAILED and one.code == 4 and "ZeroDivisionError" in one.words
     (report,) = (cells / "a").glob("calib-bug-*.txt")
     assert "Traceback" in report.read_text() and report.name in (cells / "a/run.log").read_text()
@@ -101,7 +101,7 @@ def test_a_session_runs_at_its_address(cells: Path, capsys: pytest.CaptureFixtur
 
 
 def test_what_workers_get_pickles(cells: Path) -> None:
-    task = pickle.loads(pickle.dumps(partial(fleet.run_one, command="test")))
+    task = pickle.loads(pickle.dumps(partial(fleet.run_session, command="test")))
     outcome = task(cells / "d")
     assert pickle.loads(pickle.dumps(outcome)) == outcome
 

@@ -59,23 +59,30 @@ class Calibration:
         The covariance is by the cell's whole parameter vector, zero for what is not of the arm.
         """
         cell = replace(self.cell, chain=self.chain, deflection=Deflection())
-        result, arm = np.zeros((len(layout(cell).names),) * 2), len(self.chain.elements)
+        count = len(layout(cell).names)
+        arm = len(self.chain.elements)
+        covariance = np.zeros((count, count))
         if self.robot.covariance is not None:
-            result[:arm, :arm] = self.robot.covariance
-        return cell, result
+            covariance[:arm, :arm] = self.robot.covariance
+        return cell, covariance
 
     @cached_property
-    def whole(self) -> tuple[Installation, np.ndarray]:
+    def with_corrections(self) -> tuple[Installation, np.ndarray]:
         """The cell with all that was fitted, and the covariance (p, p) of its whole parameter vector."""
-        result = np.zeros((len(layout(self.cell).names),) * 2)
-        result[np.ix_(self.free, self.free)] = self.covariance
-        return self.cell, result
+        count = len(layout(self.cell).names)
+        covariance = np.zeros((count, count))
+        covariance[np.ix_(self.free, self.free)] = self.covariance
+        return self.cell, covariance
 
     @property
-    def left(self) -> float:
-        """Rms error [m] that this calibration leaves on its rows without joint corrections; 0 if nominal."""
-        errors = self.rows and self.rows.judged("urdf").main
-        return 1e-3 * errors.rms if errors else 0.0
+    def residual_rms(self) -> float:
+        """Rms residual [m] of this calibration on its rows without joint corrections; 0 if nominal."""
+        if self.rows is None:
+            return 0.0
+        errors = self.rows.judged("urdf").main
+        if errors is None:
+            return 0.0
+        return 1e-3 * errors.rms
 
 
 def read_fits(before: Place, after: Place) -> tuple[Calibration, Calibration]:
@@ -100,31 +107,49 @@ def read_fits(before: Place, after: Place) -> tuple[Calibration, Calibration]:
 
 def read_fit(place: Place) -> Calibration:
     """Return the calibration in the folder of a fit or a session."""
-    folder, session = place.fit, place.session
+    folder = place.fit
     assert folder is not None
-    metrics, cell = folder.metrics(), read_installation(folder.path)
-    verdict_metrics = session.validation.metrics() if session and (session.validation.judged).exists() else metrics
-    unseen = [rows for rows in verdict_metrics.validation.values() if rows.unseen]
+    metrics = folder.metrics()
+    verdict_metrics = metrics
+    tolerance_mm = metrics.tolerance_mm
+    if place.session:
+        # A session's verdict is that of its validation, by the tolerance that its settings state today.
+        tolerance_mm = place.session.settings.fit.tolerance_mm
+        if place.session.validation.judged.exists():
+            verdict_metrics = place.session.validation.metrics()
+    tolerance = None
+    if tolerance_mm:
+        tolerance = 1e-3 * tolerance_mm
+    rows = metrics.fit
+    for compared_rows in verdict_metrics.validation.values():
+        if compared_rows.unseen:
+            rows = compared_rows
+            break
+
+    cell = read_installation(folder.path)
     free, covariance = read_covariance(folder.path, cell)
     robot = read_calibrated(folder.path)
-    tolerance_mm = session.settings.fit.tolerance_mm if session else metrics.tolerance_mm
     return Calibration(
-        place.name,
-        robot,
-        cell,
-        free,
-        covariance,
-        folder.learnt_joints(robot.chain.joints),
-        metrics,
-        (verdict_metrics.verdict, verdict_metrics.reason),
-        (unseen or [metrics.fit])[0],
-        1e-3 * tolerance_mm if tolerance_mm else None,
-        place.serial,
+        name=place.name,
+        robot=robot,
+        cell=cell,
+        free=free,
+        covariance=covariance,
+        learnt=folder.learnt_joints(robot.chain.joints),
+        metrics=metrics,
+        judged=(verdict_metrics.verdict, verdict_metrics.reason),
+        rows=rows,
+        tolerance=tolerance,
+        serial=place.serial,
     )
 
 
 def _nominal(name: str, like: Chain) -> Calibration:
     """Return the robot of a description, between a calibrated one's links, as a calibration without covariance."""
-    links = {"base": like.base, "tip": like.tip} if name.endswith(".urdf") else {}
-    robot = CalibratedChain(load_calibrated(name, **links).chain)
-    return Calibration(name, robot, Installation(robot.chain), np.zeros(0, dtype=int), np.zeros((0, 0)))
+    base = tip = None
+    if name.endswith(".urdf"):
+        base = like.base
+        tip = like.tip
+    robot = CalibratedChain(load_calibrated(name, base, tip).chain)
+    nothing_free = np.zeros(0, dtype=int)
+    return Calibration(name, robot, Installation(robot.chain), nothing_free, np.zeros((0, 0)))

@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from calib.apps.monitoring.comparison.change_test import ChangeTest
+from calib.apps.monitoring.comparison.change_test import ChangeTest, ParameterChange
 from calib.errors import Finding, finding
 from calib.toolkit.report_pages import Block, KeyFigure, RecordColumn, Section, Text, met, table
-from calib.toolkit.result_folders import Verdict, lines_of, settle
+from calib.toolkit.result_folders import Verdict, notes_of, settle
 from calib.units import SMALL
 
 if TYPE_CHECKING:
     from calib.toolkit.report_charts import Chart
 
-MOST = 12  # parameters shown; all are in the table on disk
+# parameters shown; all are in the table on disk
+MAX_PARAMETERS = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +55,7 @@ class ChangePart(ABC):
         """What changed, for the verdict's reason."""
 
     @abstractmethod
-    def own_findings(self) -> list[Finding]:
+    def specific_findings(self) -> list[Finding]:
         """Return the findings that this kind alone has."""
 
     @abstractmethod
@@ -76,14 +77,16 @@ class ChangePart(ABC):
     @cached_property
     def noticed(self) -> tuple[Finding, ...]:
         """Findings, worst first."""
-        return settle([*self.own_findings(), *self._shared_findings()])
+        return settle([*self.specific_findings(), *self._shared_findings()])
 
     @cached_property
     def verdict(self) -> Verdict:
         """Whether the earlier parameters are still within tolerance."""
         figures = f"{self.words}, χ² {self.found.chi2:.3g} on {self.found.freedom}"
         if self.tolerance:
-            state = "still" if self.today <= self.tolerance else "not"
+            state = "not"
+            if self.today <= self.tolerance:
+                state = "still"
             figures = f"{state} within the tolerance of {self.shown(self.tolerance)}: {figures}"
         return Verdict.of(figures, self.noticed)
 
@@ -92,7 +95,9 @@ class ChangePart(ABC):
         names = {"before": self.before.name, "after": self.after.name}
         if change_test.changed and change_test.parameters:
             first = change_test.parameters[0]
-            code = "one-parameter-changed" if change_test.alone else "several-parameters-changed"
+            code = "several-parameters-changed"
+            if change_test.alone:
+                code = "one-parameter-changed"
             change = plus_minus(first.alone, first.alone_sigma, first.unit)
             yield finding(code, name=first.name, change=change, left=change_test.unexplained, rivals=change_test.rivals)
         if any(change_test.extra):
@@ -106,16 +111,17 @@ class ChangePart(ABC):
 
     def section(self) -> Section:
         """Return a report section with verdict, what moved, changed parameters and notes."""
-        allowed = self.shown(self.tolerance) if self.tolerance else ""
+        allowed = ""
+        if self.tolerance:
+            allowed = self.shown(self.tolerance)
         reached = met(self.today, self.tolerance or 0.0)
         figure = KeyFigure(self.error_words, "", self.shown(self.today), "", self.basis, allowed, reached)
-        parameters_shown = [parameter for parameter in self.found.parameters if parameter.sigma or parameter.explained][
-            :MOST
-        ]
-        note = f"All in {self.table}."
-        first, *remaining_blocks = self.blocks()
-        parameters = table("Changed parameters, those first that explain most", _PARAMETERS, parameters_shown, note)
-        blocks = [first, Text("Notes", lines_of(self.noticed), "note"), *remaining_blocks, parameters]
+
+        title = "Changed parameters, those first that explain most"
+        compared = [parameter for parameter in self.found.parameters if parameter.sigma or parameter.explained]
+        parameters = table(title, _PARAMETERS, compared[:MAX_PARAMETERS], f"All in {self.table}.")
+        blocks = [*self.blocks(), parameters]
+        blocks.insert(1, Text("Notes", notes_of(self.noticed), "note"))
         return Section(f"Change of the {self.kind}", blocks, self.verdict.level, self.verdict.reason, [figure])
 
     @property
@@ -141,28 +147,47 @@ class ChangePart(ABC):
 
 def plus_minus(value: float, sigma: float, unit: str) -> str:
     """Return a change with its σ as text; empty without σ."""
+    if not sigma or np.isnan(sigma):
+        return ""
     factor, printed = SMALL.get(unit, (1.0, unit))
-    return "" if not sigma or np.isnan(sigma) else f"{factor * value:+.3g} ± {factor * sigma:.2g} {printed}"
+    return f"{factor * value:+.3g} ± {factor * sigma:.2g} {printed}"
 
 
 def _value(value: float, unit: str) -> str:
+    if np.isnan(value):
+        return ""
     factor, printed = SMALL.get(unit, (1.0, unit))
-    return "" if np.isnan(value) else f"{factor * value:.4g} {printed}"
+    return f"{factor * value:.4g} {printed}"
+
+
+def _before(parameter: ParameterChange) -> str:
+    return _value(parameter.before, parameter.unit)
+
+
+def _after(parameter: ParameterChange) -> str:
+    return _value(parameter.after, parameter.unit)
+
+
+def _change(parameter: ParameterChange) -> str:
+    return plus_minus(parameter.after - parameter.before, parameter.sigma, parameter.unit)
+
+
+def _sigmas(parameter: ParameterChange) -> str:
+    if not parameter.sigma:
+        return ""
+    return f"{abs(parameter.after - parameter.before) / parameter.sigma:.1f}"
+
+
+def _change_alone(parameter: ParameterChange) -> str:
+    return plus_minus(parameter.alone, parameter.alone_sigma, parameter.unit)
 
 
 _PARAMETERS = [
     RecordColumn("parameter", "{0.name}", number=False),
-    RecordColumn("before", lambda parameter: _value(parameter.before, parameter.unit)),
-    RecordColumn("after", lambda parameter: _value(parameter.after, parameter.unit)),
-    RecordColumn(
-        "change", lambda parameter: plus_minus(parameter.after - parameter.before, parameter.sigma, parameter.unit)
-    ),
-    RecordColumn(
-        "σ",
-        lambda parameter: f"{abs(parameter.after - parameter.before) / parameter.sigma:.1f}" if parameter.sigma else "",
-    ),
-    RecordColumn(
-        "if it changed alone", lambda parameter: plus_minus(parameter.alone, parameter.alone_sigma, parameter.unit)
-    ),
-    RecordColumn("χ² explained", lambda parameter: f"{parameter.explained:.3g}"),
+    RecordColumn("before", _before),
+    RecordColumn("after", _after),
+    RecordColumn("change", _change),
+    RecordColumn("σ", _sigmas),
+    RecordColumn("if it changed alone", _change_alone),
+    RecordColumn("χ² explained", "{0.explained:.3g}"),
 ]

@@ -21,9 +21,12 @@ from scipy.stats import chi2, norm
 
 from calib.toolkit.result_folders import limit
 
-SPAN = 1e-5  # sine of an angle below which two combinations are one
-CHANCE = 0.01  # probability below which a χ² is no chance, as 2.6 σ
-AS_WELL = 4.0  # χ² by which a second explanation may be worse: 2 σ
+# sine of an angle below which two combinations are one
+SPAN = 1e-5
+# probability below which a χ² is no chance, as 2.6 σ
+CHANCE = 0.01
+# χ² by which a second explanation may be worse: 2 σ
+AS_WELL = 4.0
 
 
 class ParameterChange(NamedTuple):
@@ -71,8 +74,10 @@ class ChangeTest:
         if self.freedom == 0:
             return 1.0
         explained = [parameter.explained for parameter in self.parameters if parameter.explained]
-        single = max(len(explained), 1) * chi2.sf(max(explained, default=0.0), 1)
-        return min(2.0 * float(min(chi2.sf(self.chi2, self.freedom), single)), 1.0)
+        of_one = max(len(explained), 1) * chi2.sf(max(explained, default=0.0), 1)
+        of_all = chi2.sf(self.chi2, self.freedom)
+        # two tests, of which the less likely one counts
+        return min(2.0 * float(min(of_all, of_one)), 1.0)
 
     @property
     def sigmas(self) -> float:
@@ -87,7 +92,9 @@ class ChangeTest:
     @property
     def unexplained(self) -> float:
         """χ² that is left where only the first parameter changed."""
-        return max(self.chi2 - self.parameters[0].explained, 0.0) if self.parameters else self.chi2
+        if not self.parameters:
+            return self.chi2
+        return max(self.chi2 - self.parameters[0].explained, 0.0)
 
     @property
     def alone(self) -> bool:
@@ -102,7 +109,9 @@ class ChangeTest:
 
     def suffices(self, explained: float, count: int) -> bool:
         """Return whether what `count` parameters explain of χ² leaves no more than chance."""
-        return bool(chi2.sf(max(self.chi2 - explained, 0.0), max(self.freedom - count, 1)) > CHANCE)
+        residual = max(self.chi2 - explained, 0.0)
+        freedom = max(self.freedom - count, 1)
+        return bool(chi2.sf(residual, freedom) > CHANCE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,11 +140,14 @@ class Tested:
 
     def together(self, chosen: np.ndarray) -> tuple[np.ndarray, float, int]:
         """Return the steps (p,) of several parameters that explain most, the χ² that they explain, and their number."""
-        columns, steps = self.columns[:, chosen], np.zeros(self.columns.shape[1])
+        columns = self.columns[:, chosen]
         size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-        scaled_steps, _, rank, _ = np.linalg.lstsq(columns / size, self.difference, rcond=SPAN)
+        unit_columns = columns / size
+        scaled_steps, _, rank, _ = np.linalg.lstsq(unit_columns, self.difference, rcond=SPAN)
+        explained = float(np.sum((unit_columns @ scaled_steps) ** 2))
+        steps = np.zeros(self.columns.shape[1])
         steps[chosen] = scaled_steps / size
-        return steps, float(np.sum((columns / size @ scaled_steps) ** 2)), int(rank)
+        return steps, explained, int(rank)
 
 
 def tested(
@@ -149,19 +161,24 @@ def tested(
         spans: (s, any) orthonormal columns: what either has estimated.
         columns: (s, p) what each parameter does to the combinations.
     """
-    extra = [np.zeros((len(change), 0))] * 2
+    no_combination = np.zeros((len(change), 0))
+    extra = [no_combination, no_combination]
     fitted = [basis for basis in spans if basis.shape[1]]
     if len(fitted) == 2:
-        extra = [span(basis_ - other_basis @ (other_basis.T @ basis_)) for basis_, other_basis in (spans, spans[::-1])]
+        first, second = spans
+        extra = [span(first - second @ (second.T @ first)), span(second - first @ (first.T @ second))]
+        # A combination of only one estimate is conditioned on the value that the other one has.
         for index, surplus in enumerate(extra):
-            gain = np.linalg.lstsq(surplus.T @ covariances[index] @ surplus, surplus.T @ covariances[index])[0].T
+            covariance = covariances[index]
+            gain = np.linalg.lstsq(surplus.T @ covariance @ surplus, surplus.T @ covariance)[0].T
             change = change - gain @ (surplus.T @ change)
-            covariances[index] = covariances[index] - gain @ surplus.T @ covariances[index]
-    nothing = np.zeros((len(change), 0))
-    together, surplus = span(np.hstack([nothing, *fitted])), np.hstack(extra)
+            covariances[index] = covariance - gain @ surplus.T @ covariance
+    together = span(np.hstack([no_combination, *fitted]))
+    surplus = np.hstack(extra)
     common = span(together - surplus @ (surplus.T @ together))
     values, vectors = np.linalg.eigh(common.T @ np.add(*covariances) @ common)
-    whiten = (vectors / np.sqrt(np.maximum(values, 1e-14 * values.max(initial=0.0)))).T @ common.T
+    scales = np.sqrt(np.maximum(values, 1e-14 * values.max(initial=0.0)))
+    whiten = (vectors / scales).T @ common.T
     counts = extra[0].shape[1], extra[1].shape[1]
     return Tested(whiten @ change, whiten @ columns, counts), common.T @ columns
 

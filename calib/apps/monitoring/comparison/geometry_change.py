@@ -249,7 +249,7 @@ def _pair(before: Calibration, after: Calibration, settings: DiffSettings) -> _P
     covariances = []
     for calibration, station, tool in zip((before, after), stations, tools):
         if counted_frames:
-            cell, covariance = calibration.whole
+            cell, covariance = calibration.with_corrections
         else:
             cell, covariance = calibration.rigid
         ends = np.cumsum(layout_counts(cell))[:-1]

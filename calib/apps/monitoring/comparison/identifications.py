@@ -92,42 +92,56 @@ def read_models(before: Place, after: Place) -> tuple[Identified, Identified]:
         UsageError: where their torques are of different kinds.
         RobotError: where they are of different robots.
     """
-    earlier, later = _read(before), _read(after)
+    earlier = _read(before)
+    later = _read(after)
     check_same_robot((earlier.name, later.name), (earlier.robot, later.robot))
-    kinds = [(model.unit, model.model.torque_rows.name) for model in (earlier, later)]
-    message = f"{earlier.name} and {later.name}: torques of {{}} and of {{}} cannot be compared; identify both alike"
-    require(kinds[0] == kinds[1], message.format(*(" in ".join(kind[::-1]) for kind in kinds)), UsageError)
+    kind_before = f"{earlier.model.torque_rows.name} in {earlier.unit}"
+    kind_after = f"{later.model.torque_rows.name} in {later.unit}"
+    kinds = f"torques of {kind_before} and of {kind_after}"
+    message = f"{earlier.name} and {later.name}: {kinds} cannot be compared; identify both alike"
+    require(kind_before == kind_after, message, UsageError)
     return earlier, later
 
 
 def _read(place: Place) -> Identified:
-    folder, session = place.identification, place.session
+    folder = place.identification
     assert folder is not None
-    dynamics, metrics, table = folder.dynamics(), folder.metrics(), read_model_table(folder.path)
+    dynamics = folder.dynamics()
+    table = read_model_table(folder.path)
     names, covariance = folders.read_covariance(folder.path)
-    measured = ~np.isin(names, metrics.switched_off)
+    measured = ~np.isin(names, folder.metrics().switched_off)
+
     standard = dynamics.model.names
-    regrouping = {
-        _key(dynamics.model, standard.index(standard_name(name, standard))): row
-        for name, row in table["regrouping"].items()
-    }
-    units = dict(zip(standard, dynamics.model.units))
-    verdict, tables = folder.judged, {f"{place.name}/{path.name}": path for path in folder.torques}
-    motions = {name: read_states(path, dynamics.model.n) for name, path in tables.items()}
+    unit_of = dict(zip(standard, dynamics.model.units))
+    units = [unit_of[standard_name(name, standard)] for name in names]
+    regrouping = {}
+    for name, row in table["regrouping"].items():
+        column = standard.index(standard_name(name, standard))
+        regrouping[_key(dynamics.model, column)] = row
+
+    motions = {}
+    for path in folder.torques:
+        states = read_states(path, dynamics.model.n)
+        if states:
+            motions[f"{place.name}/{path.name}"] = states
+    tolerance_percent = 0.0
+    if place.session:
+        tolerance_percent = place.session.settings.dynamics.tolerance_percent
+    verdict = folder.judged
     return Identified(
-        place.name,
-        read_calibrated(folder.path),
-        dynamics,
-        names,
-        tuple(units[standard_name(name, standard)] for name in names),
-        estimated_columns(dynamics, names),
-        covariance * np.outer(measured, measured),
-        regrouping,
-        {name: states for name, states in motions.items() if states},
-        table.get("unit", TORQUE),
-        (verdict.verdict, verdict.reason),
-        session.settings.dynamics.tolerance_percent if session else 0.0,
-        place.serial,
+        name=place.name,
+        robot=read_calibrated(folder.path),
+        dynamics=dynamics,
+        names=names,
+        units=tuple(units),
+        columns=estimated_columns(dynamics, names),
+        covariance=covariance * np.outer(measured, measured),
+        regrouping=regrouping,
+        motions=motions,
+        unit=table.get("unit", TORQUE),
+        judged=(verdict.verdict, verdict.reason),
+        tolerance=tolerance_percent,
+        serial=place.serial,
     )
 
 
@@ -146,10 +160,14 @@ def read_states(path: Path, joints: int) -> MotionStates | None:
         UsageError: for another number of joints.
     """
     table = read_table(path)
-    q, v, a, measured = (table.block(name) for name in ("q", "v", "a", "measured"))
+    q = table.block("q")
+    v = table.block("v")
+    a = table.block("a")
     if q is None or v is None or a is None:
         return None
     message = f"{path}: columns q_…, v_… and a_… of {joints} joints each are needed"
-    require({block.shape[1] for block in (q, v, a)} == {joints}, message, UsageError)
-    t = table.numbers("t", None) if "t" in table.header else np.arange(len(q), dtype=float)
-    return MotionStates(t, (q, v, a), measured)
+    require(q.shape[1] == v.shape[1] == a.shape[1] == joints, message, UsageError)
+    t = np.arange(len(q), dtype=float)
+    if "t" in table.header:
+        t = table.numbers("t", None)
+    return MotionStates(t, (q, v, a), table.block("measured"))

@@ -10,11 +10,11 @@ import numpy as np
 from calib.errors import RobotError, UsageError, command_line, listing, require
 from calib.result_kinds import refusal
 from calib.toolkit.chains import CalibratedChain, Element
-from calib.toolkit.opened_results import open_result
-from calib.toolkit.result_folders import FitFolder, IdentificationFolder
+from calib.toolkit.result_folders import FitFolder, IdentificationFolder, open_result
 from calib.toolkit.sessions import Session
 
-SAME = 1e-9  # of two nominal descriptions: largest difference [m, rad] that rounding in files explains
+# of two nominal descriptions: largest difference [m, rad] that rounding in files explains
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -40,15 +40,21 @@ class Place:
     @property
     def serial(self) -> str:
         """Serial number of the robot as its session states it; empty if unknown."""
-        return self.session.settings.certificate.robot_serial if self.session else ""
+        if self.session is None:
+            return ""
+        return self.session.settings.certificate.robot_serial
 
     @property
     def words(self) -> str:
         """What it holds, in a clause."""
-        contents = [name for name, result in (("geometry", self.fit), ("dynamics", self.identification)) if result]
-        if contents or not self.session:
-            return f"{self.name} holds {' and '.join(contents) or 'the nominal robot'}"
-        return f"{self.name} holds no result yet ({command_line('next', self.name)})"
+        contents = []
+        if self.fit:
+            contents.append("geometry")
+        if self.identification:
+            contents.append("dynamics")
+        if self.session and not contents:
+            return f"{self.name} holds no result yet ({command_line('next', self.name)})"
+        return f"{self.name} holds {' and '.join(contents) or 'the nominal robot'}"
 
 
 def place_of(source: str | Path, verb: str = "diff") -> Place:
@@ -57,40 +63,47 @@ def place_of(source: str | Path, verb: str = "diff") -> Place:
     Raises:
         UsageError: for a folder of something else.
     """
-    path, name = Path(source), str(source)
+    path = Path(source)
+    name = str(source)
     if not path.is_dir():
         return Place(name)
     result = open_result(path, verb)
-    fit, identification = result.fit(verb), result.identification
+    result.check_arm(verb)
+    fit, identification = result.fit, result.identification
     require(result.session or fit or identification, refusal(path, verb), UsageError)
     return Place(name, result.session, fit, identification)
 
 
 def check_same_robot(names: tuple[str, str], robots: tuple[CalibratedChain, CalibratedChain]) -> None:
     """Raise `RobotError` for two calibrations whose nominal descriptions differ."""
-    first, second = (robot.nominal or robot.chain for robot in robots)
+    first = robots[0].nominal or robots[0].chain
+    second = robots[1].nominal or robots[1].chain
     beginning = f"{names[0]} and {names[1]} are of different robots"
-    for attribute in ("joint_names", "names"):
-        first_names, second_names = getattr(first, attribute), getattr(second, attribute)
-        strange = [name for name in (*first_names, *second_names) if (name in first_names) != (name in second_names)]
-        kind = "joints" if attribute == "joint_names" else "parameters"
-        message = f"{beginning} ({first.name}, {second.name}): {kind} {listing(strange, 5)} exist in one of them only"
-        require(
-            first_names == second_names,
-            message if strange else f"{beginning}: their {kind} are in another order",
-            RobotError,
-        )
-    difference = np.abs(first.values - second.values)
-    difference = np.maximum(
-        difference, [np.abs(_placed(a) - _placed(b)).max() for a, b in zip(first.elements, second.elements)]
-    )
-    differing = [name for name, size in zip(first.names, difference) if size > SAME]
-    tail = np.abs(first.tail - second.tail).max()
+    compared = (("joints", first.joint_names, second.joint_names), ("parameters", first.names, second.names))
+    for kind, names_first, names_second in compared:
+        strange = [name for name in names_first if name not in names_second]
+        strange += [name for name in names_second if name not in names_first]
+        message = f"{beginning}: their {kind} are in another order"
+        if strange:
+            message = (
+                f"{beginning} ({first.name}, {second.name}): {kind} {listing(strange, 5)} exist in one of them only"
+            )
+        require(names_first == names_second, message, RobotError)
+
+    differing = []
+    for k, name in enumerate(first.names):
+        step = np.abs(first.values[k] - second.values[k])
+        frame_step = np.abs(_placement(first.elements[k]) - _placement(second.elements[k])).max()
+        if max(step, frame_step) > ROUNDING:
+            differing.append(name)
+    same_end = np.abs(first.tail - second.tail).max() <= ROUNDING
     ends = f"{beginning}: one ends at {first.tip}, the other at {second.tip}; fit one of them again with --tip"
-    require(differing or tail <= SAME or first.tip == second.tip, ends, RobotError)
+    require(differing or same_end or first.tip == second.tip, ends, RobotError)
     message = f"{beginning}: the nominal {listing(differing or ['tip'], 5)} differ; fit both from one description"
-    require(not differing and tail <= SAME, message, RobotError)
+    require(not differing and same_end, message, RobotError)
 
 
-def _placed(element: Element) -> np.ndarray:
-    return np.eye(4) if element.placement is None else element.placement
+def _placement(element: Element) -> np.ndarray:
+    if element.placement is None:
+        return np.eye(4)
+    return element.placement

@@ -22,7 +22,7 @@ from calib.arguments import checked
 from calib.errors import Finding, UsageError, require
 from calib.records import plain
 from calib.result_kinds import BY_NAME
-from calib.toolkit.report_pages import Section
+from calib.toolkit.report_pages import Block, KeyFigure, Section
 from calib.toolkit.result_folders import LEVELS, ChartedResult, DynamicsModel, GeometryFit, Judged, Verdict, saved
 
 if TYPE_CHECKING:
@@ -49,50 +49,61 @@ class RobotChange(ChartedResult, Judged):
         """Whether the earlier parameters are still within tolerance: of the worst part."""
         worst = max(self.parts, key=lambda part: LEVELS.index(part.verdict.level))
         verdict = worst.verdict
-        return verdict if len(self.parts) == 1 else replace(verdict, reason=f"{worst.kind}: {verdict.reason}")
+        if len(self.parts) == 1:
+            return verdict
+        return replace(verdict, reason=f"{worst.kind}: {verdict.reason}")
 
     @property
     def noticed(self) -> tuple[Finding, ...]:
         """The findings of all parts."""
-        return tuple(finding_ for part in self.parts for finding_ in part.noticed)
+        findings: list[Finding] = []
+        for part in self.parts:
+            findings += part.noticed
+        return tuple(findings)
 
     @property
     def geometry(self) -> GeometryChange | None:
         """What moved; None where only dynamics are compared."""
-        return self._found("geometry")
+        return self._change_of("geometry")
 
     @property
     def dynamics(self) -> DynamicsChange | None:
         """What changed of the dynamics; None where only geometries are compared."""
-        return self._found("dynamics")
+        return self._change_of("dynamics")
 
-    def _found(self, kind: str) -> Any:
-        return next((part.found for part in self.parts if part.kind == kind), None)
+    def _change_of(self, kind: str) -> Any:
+        for part in self.parts:
+            if part.kind == kind:
+                return part.found
+        return None
 
     def section(self) -> Section:
         """Return all parts as one report section."""
-        sections = [part.section() for part in self.parts]
-        blocks, figures = (
-            [item for section in sections for item in getattr(section, name)] for name in ("blocks", "figures")
-        )
+        blocks: list[Block] = []
+        figures: list[KeyFigure] = []
+        for part in self.parts:
+            section = part.section()
+            blocks += section.blocks
+            figures += section.figures
         return Section("Change", blocks, self.verdict.level, self.verdict.reason, figures)
 
     def charts(self) -> dict[str, Chart]:
         """Return what the figures show: the tool's motion over the workspace, changes of parameters and torque."""
-        return {name: chart for part in self.parts for name, chart in part.charts().items()}
+        charts: dict[str, Chart] = {}
+        for part in self.parts:
+            charts |= part.charts()
+        return charts
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
         """Write a folder: report.html, tables of all parameters, metrics.json, and the figures as PNG."""
-        parts = [
-            pages.ResultPart(
-                part.section(),
-                part.charts() if plots else {},
-                part.captions,
-                (part.table, ParameterChange._fields, part.found.parameters),
-            )
-            for part in self.parts
-        ]
+        parts = []
+        for part in self.parts:
+            charts: dict[str, Chart] = {}
+            if plots:
+                charts = part.charts()
+            parameters = (part.table, ParameterChange._fields, part.found.parameters)
+            parts.append(pages.ResultPart(part.section(), charts, part.captions, parameters))
         earlier, later, robot = self._names
         setup = {"earlier": earlier, "later": later}
         return pages.save(Path(out), "comparison", f"Change of {robot}", setup, parts, self.to_dict(), TABLES)
@@ -105,8 +116,15 @@ class RobotChange(ChartedResult, Judged):
     def to_dict(self) -> dict[str, object]:
         """Return the numbers as in ``metrics.json`` [SI]."""
         before, after, _ = self._names
-        judged = {"verdict": self.verdict.level, "reason": self.verdict.reason}
-        return plain({"before": before, "after": after, **judged} | {one.kind: one.to_dict() for one in self.parts})
+        numbers: dict[str, Any] = {
+            "before": before,
+            "after": after,
+            "verdict": self.verdict.level,
+            "reason": self.verdict.reason,
+        }
+        for part in self.parts:
+            numbers[part.kind] = part.to_dict()
+        return plain(numbers)
 
     def __repr__(self) -> str:
         return f"<RobotChange of {self._names[2]}: {self.verdict.level}>"
@@ -133,22 +151,27 @@ def diff(before: Compared, after: Compared, settings: DiffSettings = DEFAULT_DIF
         RobotError: where they are of different robots.
     """
     with saved(before) as first, saved(after) as second:
-        earlier, later = place_of(first), place_of(second)
+        earlier = place_of(first)
+        later = place_of(second)
         parts = [*_tool_parts(earlier, later, settings), *_torque_parts(earlier, later, settings)]
+    message = f"nothing to compare: {earlier.words}, {later.words}"
     if earlier.nominal and later.nominal:
         message = f"neither {before} nor {after} is the folder of a fit or of a session; give at least one"
-    else:
-        message = f"nothing to compare: {earlier.words}, {later.words}"
     require(parts, message, UsageError)
     return RobotChange(tuple(parts))
 
 
 def _tool_parts(before: Place, after: Place, settings: DiffSettings) -> list[ChangePart]:
-    if not any(side.fit for side in (before, after)) or not all(side.fit or side.nominal for side in (before, after)):
+    if not before.fit and not after.fit:
         return []
+    # Where one of the two has no fit, it has to be the nominal robot.
+    for calibration in (before, after):
+        if not calibration.fit and not calibration.nominal:
+            return []
     earlier, later = read_fits(before, after)
     change = geometry_change.compare(earlier, later, settings)
-    return [ToolPart(earlier, later, change, settings.tolerance or later.tolerance or earlier.tolerance, settings)]
+    tolerance = settings.tolerance or later.tolerance or earlier.tolerance
+    return [ToolPart(earlier, later, change, tolerance, settings)]
 
 
 def _torque_parts(before: Place, after: Place, settings: DiffSettings) -> list[ChangePart]:
@@ -163,6 +186,5 @@ def _torque_parts(before: Place, after: Place, settings: DiffSettings) -> list[C
     message = f"neither {earlier.name} nor {later.name} holds a motion without payload; give one with --motion"
     require(motions, message, UsageError)
     change = torque_change.compare(earlier, later, motions)
-    return [
-        TorquePart(earlier, later, change, settings.torque_tolerance or later.tolerance or earlier.tolerance or None)
-    ]
+    tolerance = settings.torque_tolerance or later.tolerance or earlier.tolerance or None
+    return [TorquePart(earlier, later, change, tolerance)]

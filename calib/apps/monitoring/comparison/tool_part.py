@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -14,7 +14,7 @@ from calib.apps.monitoring.comparison.geometry_change import ToolMotion
 from calib.apps.monitoring.settings import DEFAULT_DIFF, DiffSettings
 from calib.errors import Finding, finding
 from calib.toolkit.report_pages import Block, FittedParameter, RecordColumn, Text, table
-from calib.units import JOINT, NamedJoint
+from calib.units import JOINT
 
 if TYPE_CHECKING:
     from calib.toolkit.report_charts import Chart
@@ -37,7 +37,7 @@ class ToolPart(ChangePart):
 
     @property
     def today(self) -> float:
-        return float(np.hypot(self.found.motions[0].rms, self.after.left))
+        return float(np.hypot(self.found.motions[0].rms, self.after.residual_rms))
 
     @property
     def words(self) -> str:
@@ -51,57 +51,67 @@ class ToolPart(ChangePart):
     def shown(self, value: float) -> str:
         return f"{1e3 * value:.3g} mm"
 
-    def own_findings(self) -> list[Finding]:
-        before, after, change_test, result = self.before, self.after, self.found, list[Finding]()
-        motion, residual = change_test.motions[0], max(before.left, after.left)
+    def specific_findings(self) -> list[Finding]:
+        before = self.before
+        after = self.after
+        change = self.found
+        motion = change.motions[0]
+        residual_rms = max(before.residual_rms, after.residual_rms)
+        ratio = motion.rms / max(residual_rms, 1e-12)
+        beyond = ratio
+        result: list[Finding] = []
         if self.tolerance:
+            # Whether the change matters is then said by the tolerance.
+            beyond = 0.0
             result.append(finding("outgrown", times=self.today / self.tolerance, today=self.today, after=after.name))
-            wide = change_test.motions[1]
-            times = np.sqrt(max(wide.rms**2 - wide.expected**2, 0.0)) / self.tolerance
-            result.append(finding("outgrown-elsewhere", times=times, moved=wide.rms, expected=wide.expected))
-        ratio = motion.rms / max(residual, 1e-12)
-        if not change_test.freedom:
+            at_random = change.motions[1]
+            significant = np.sqrt(max(at_random.rms**2 - at_random.expected**2, 0.0))
+            times = significant / self.tolerance
+            result.append(finding("outgrown-elsewhere", times=times, moved=at_random.rms, expected=at_random.expected))
+        if not change.freedom:
             result.append(finding("arm-not-tested", names=[before.name, after.name]))
+        hidden_by = None
+        if ratio <= 1.0:
+            hidden_by = residual_rms
+        sigmas = change.sigmas
         result.append(
-            finding(
-                "arm-changed",
-                sigmas=change_test.sigmas,
-                beyond=0.0 if self.tolerance else ratio,
-                probability=change_test.probability,
-                left=residual if ratio <= 1.0 else None,
-            )
+            finding("arm-changed", sigmas=sigmas, beyond=beyond, probability=change.probability, left=hidden_by)
         )
-        corrected, counts = (
-            [calibration.name for calibration in (before, after) if calibration.cell.deflection.terms],
-            self.settings,
-        )
-        if corrected and not (counts.same_base or counts.same_tool):
-            corrected_rms = geometry_change.corrected_motion(before, after, counts)
+
+        same_base = self.settings.same_base
+        same_tool = self.settings.same_tool
+        corrected = [calibration.name for calibration in (before, after) if calibration.cell.deflection.terms]
+        if corrected and not (same_base or same_tool):
+            corrected_rms = geometry_change.corrected_motion(before, after, self.settings)
             result.append(finding("corrections-not-compared", names=corrected, moved=corrected_rms))
-        counted: Mapping[str, bool] = {"base": counts.same_base, "tool": counts.same_tool}
-        for name, step in change_test.frames.items():
-            if not counted[name]:
-                size = {"way": np.linalg.norm(step[:3]), "turn": np.linalg.norm(step[3:])}
-                frame = {"base": "the base in the instrument's frame", "tool": "the tool on the flange"}[name]
-                result.append(finding("placed-again", what=frame, option=f"--same-{name}", **size))
+        frames = (
+            ("base", same_base, "the base in the instrument's frame"),
+            ("tool", same_tool, "the tool on the flange"),
+        )
+        for name, counts, description in frames:
+            step = change.frames.get(name)
+            if step is None or counts:
+                continue
+            way = np.linalg.norm(step[:3])
+            turn = np.linalg.norm(step[3:])
+            result.append(finding("placed-again", what=description, option=f"--same-{name}", way=way, turn=turn))
         return result
 
     def blocks(self) -> list[Block]:
-        joints = self.before.chain.joints
         motions = [
             RecordColumn("target's motion at", "{0.where}", number=False),
             RecordColumn("poses", lambda motion: f"{len(motion.q)}"),
-            RecordColumn("median mm", lambda motion: f"{1e3 * np.median(motion.position):.3g}"),
+            RecordColumn("median mm", _median_mm),
             RecordColumn("rms mm", lambda motion: f"{1e3 * motion.rms:.3g}"),
             RecordColumn("σ of that mm", lambda motion: f"{1e3 * motion.expected:.2g}"),
-            RecordColumn("worst mm", lambda motion: f"{1e3 * motion.position.max():.3g}"),
-            RecordColumn("median mrad", lambda motion: f"{1e3 * np.median(motion.orientation):.3g}"),
-            RecordColumn("worst mrad", lambda motion: f"{1e3 * motion.orientation.max():.3g}"),
-            RecordColumn("worst at", lambda motion: _joints(motion, joints), number=False),
+            RecordColumn("worst mm", _worst_mm),
+            RecordColumn("median mrad", _median_mrad),
+            RecordColumn("worst mrad", _worst_mrad),
+            RecordColumn("worst at", self._worst_joints, number=False),
         ]
         by_joint = [
             RecordColumn("joint", "{0[0]}", number=False),
-            RecordColumn("rms mm", lambda motion: f"{1e3 * motion[1]:.3g}"),
+            RecordColumn("rms mm", lambda row: f"{1e3 * row[1]:.3g}"),
         ]
         return [
             Text("Motion", self._motion()),
@@ -111,38 +121,47 @@ class ToolPart(ChangePart):
 
     def _motion(self) -> list[str]:
         """Return sentences on the target's motion: how far, where most, and by which joint."""
-        change_test = self.found
-        joint, joint_rms = max(change_test.by_joint, key=lambda motion: motion[1])
-        lines = [
-            f"{motion.where} ({len(motion.q)}): the tool moved by {1e3 * np.median(motion.position):.3g} mm (median), "
-            f"{1e3 * motion.position.max():.3g} mm (worst, at {_joints(motion, self.before.chain.joints)}), "
-            f"and turned by {1e3 * np.median(motion.orientation):.3g} and {1e3 * motion.orientation.max():.3g} mrad"
-            for motion in change_test.motions
-        ]
-        return (
-            [*lines, f"most of it comes from {joint}: {1e3 * joint_rms:.3g} mm rms"] if change_test.changed else lines
-        )
+        change = self.found
+        lines = []
+        for motion in change.motions:
+            beginning = f"{motion.where} ({len(motion.q)}): the tool moved by {_median_mm(motion)} mm (median)"
+            worst = f"{_worst_mm(motion)} mm (worst, at {self._worst_joints(motion)})"
+            turns = f"and turned by {_median_mrad(motion)} and {_worst_mrad(motion)} mrad"
+            lines.append(f"{beginning}, {worst}, {turns}")
+        if change.changed:
+            joint, joint_rms = max(change.by_joint, key=itemgetter(1))
+            lines.append(f"most of it comes from {joint}: {1e3 * joint_rms:.3g} mm rms")
+        return lines
+
+    def _worst_joints(self, motion: ToolMotion) -> str:
+        """Return the joint values of the worst pose."""
+        values = []
+        for joint, value in zip(self.before.chain.joints, motion.q[motion.position.argmax()]):
+            factor, unit = JOINT[joint.kind]
+            values.append(f"{factor * value:.0f} {unit}")
+        return ", ".join(values)
 
     def charts(self) -> dict[str, Chart]:
         from calib.toolkit.report_charts import error_map, parameter_changes
 
         motion = self.found.motions[0]
-        arm = {element.name: k for k, element in enumerate(self.before.chain.elements)}
-        rows = [
-            FittedParameter(
-                parameter.name, parameter.unit, parameter.before, parameter.after, parameter.sigma, None, "arm"
-            )
-            for parameter in sorted(self.found.parameters, key=lambda parameter: arm[parameter.name])
-            if parameter.sigma
-        ]
-        result = {"map": error_map(motion.points, motion.position, words="the tool moved by up to {}")}
+        changes = {parameter.name: parameter for parameter in self.found.parameters}
+        rows = []
+        for element in self.before.chain.elements:
+            change = changes[element.name]
+            if change.sigma:
+                rows.append(
+                    FittedParameter(change.name, change.unit, change.before, change.after, change.sigma, None, "arm")
+                )
+        charts = {"map": error_map(motion.points, motion.position, words="the tool moved by up to {}")}
         if rows:
-            result["parameters"] = parameter_changes(rows, of="later - earlier")
-        return result
+            charts["parameters"] = parameter_changes(rows, of="later - earlier")
+        return charts
 
     def numbers(self) -> dict[str, object]:
-        motions = {
-            motion.where: {
+        motions = {}
+        for motion in self.found.motions:
+            motions[motion.where] = {
                 "poses": len(motion.q),
                 "rms": motion.rms,
                 "expected": motion.expected,
@@ -152,13 +171,20 @@ class ToolPart(ChangePart):
                 "turn_median": float(np.median(motion.orientation)),
                 "turn_worst": float(motion.orientation.max()),
             }
-            for motion in self.found.motions
-        }
         return {"motions": motions, "by_joint": dict(self.found.by_joint)}
 
 
-def _joints(motion: ToolMotion, joints: Sequence[NamedJoint]) -> str:
-    """Return the joint values of the worst pose."""
-    worst = motion.q[motion.position.argmax()]
-    factors_and_units = (JOINT[joint.kind] for joint in joints)
-    return ", ".join(f"{factor * value:.0f} {unit}" for (factor, unit), value in zip(factors_and_units, worst))
+def _median_mm(motion: ToolMotion) -> str:
+    return f"{1e3 * np.median(motion.position):.3g}"
+
+
+def _worst_mm(motion: ToolMotion) -> str:
+    return f"{1e3 * motion.position.max():.3g}"
+
+
+def _median_mrad(motion: ToolMotion) -> str:
+    return f"{1e3 * np.median(motion.orientation):.3g}"
+
+
+def _worst_mrad(motion: ToolMotion) -> str:
+    return f"{1e3 * motion.orientation.max():.3g}"

@@ -17,8 +17,10 @@ from calib.apps.monitoring.comparison.change_test import ChangeTest, ParameterCh
 from calib.apps.monitoring.comparison.identifications import Identified, MotionStates
 from calib.toolkit.torque_models import IdentificationModel, parameter_variances, standard_name
 
-PARALLEL = 1e-6  # sine of an angle between what two parameters do to the combinations, below which they are one
-NEARLY_ALL = 0.9  # of χ²; σ of real motions holds no unmodelled effects, which leave a rest (our choice)
+# sine of an angle between what two parameters do to the combinations, below which they are one
+PARALLEL = 1e-6
+# of χ²; σ of real motions holds no unmodelled effects, which leave a residual (our choice)
+NEARLY_ALL = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,58 +81,84 @@ class DynamicsChange(ChangeTest):
     def part(self) -> PartChange | None:
         """The part that explains most, if it explains all but chance, or `NEARLY_ALL` of χ²; else None."""
         first = self.parts[0]
-        enough = self.suffices(first.explained, first.count) or first.explained > NEARLY_ALL * self.chi2
-        return first if enough else None
+        if self.suffices(first.explained, first.count) or first.explained > NEARLY_ALL * self.chi2:
+            return first
+        return None
 
 
 def compare(before: Identified, after: Identified, motions: dict[str, MotionStates]) -> DynamicsChange:
     """Return what changed between two models of one robot, the torque over motions."""
     keys = list(dict.fromkeys([*before.keys, *after.keys]))
-    values, covariances = zip(*(_spread(model, keys) for model in (before, after)))
-    sigma = np.sqrt(np.diag(np.add(*covariances)))
+    values_before, covariance_before = _among(before, keys)
+    values_after, covariance_after = _among(after, keys)
+    sigma = np.sqrt(np.diag(covariance_before + covariance_after))
     unit = np.where(sigma > 0.0, sigma, 1.0)
-    spans = [np.eye(len(keys))[:, np.diag(model) > 0.0] for model in covariances]
+    units = np.outer(unit, unit)
+    axes = np.eye(len(keys))
+    spans = [axes[:, np.diag(covariance_before) > 0.0], axes[:, np.diag(covariance_after) > 0.0]]
     standard = _standard(before, after, keys)
     columns = np.column_stack([column for _, _, column in standard]) / unit[:, None]
-    scaled = [model / np.outer(unit, unit) for model in covariances]
-    test, _ = tested((values[1] - values[0]) / unit, scaled, spans, columns)
+    scaled = [covariance_before / units, covariance_after / units]
+    test, _ = tested((values_after - values_before) / unit, scaled, spans, columns)
+
     changes = []
-    for k in _apart(columns, len(keys)):
-        values_and_sigma = (values[0][k], values[1][k], sigma[k]) if k < len(keys) else (np.nan, np.nan, 0.0)
+    for k in _distinct(columns, len(keys)):
         name, kind, _ = standard[k]
-        changes.append(ParameterChange(name, kind, *values_and_sigma, *test.alone(k)))
-    changes.sort(key=lambda model: -model.explained)
+        alone = test.alone(k)
+        if k < len(keys):
+            change = ParameterChange(name, kind, values_before[k], values_after[k], sigma[k], *alone)
+        else:
+            # a parameter that was regrouped has no value of its own
+            change = ParameterChange(name, kind, np.nan, np.nan, 0.0, *alone)
+        changes.append(change)
+    changes.sort(key=lambda change: -change.explained)
+
+    torques = [_torque(name, states, before, after) for name, states in motions.items()]
     names = [standard_name(name, after.model.names) for name, _, _ in standard]
-    torques = tuple(_torque(name, states, before, after) for name, states in motions.items())
-    parts = _parts(test, after.model, names, next(iter(motions.values())))
-    return DynamicsChange(test.chi2, len(test.difference), tuple(changes), test.extra, parts, torques)
+    first_motion = next(iter(motions.values()))
+    parts = _parts(test, after.model, names, first_motion)
+    return DynamicsChange(test.chi2, len(test.difference), tuple(changes), test.extra, parts, tuple(torques))
 
 
-def _spread(model: Identified, keys: list[Hashable]) -> tuple[np.ndarray, np.ndarray]:
+def _among(model: Identified, keys: list[Hashable]) -> tuple[np.ndarray, np.ndarray]:
     """Return the values (s,) and the covariance (s, s) of a model's parameters among all that either has."""
     indices = [keys.index(key) for key in model.keys]
-    values, covariance = np.zeros(len(keys)), np.zeros((len(keys),) * 2)
-    values[indices], covariance[np.ix_(indices, indices)] = model.values, model.covariance
+    values = np.zeros(len(keys))
+    values[indices] = model.values
+    covariance = np.zeros((len(keys), len(keys)))
+    covariance[np.ix_(indices, indices)] = model.covariance
     return values, covariance
 
 
 def _standard(before: Identified, after: Identified, keys: list[Hashable]) -> list[tuple[str, str, np.ndarray]]:
     """Return name, unit, and what it does to the s combinations (s,), of each of these and of regrouped parameters."""
-    name_and_unit = {
-        key: (name, unit) for model in (before, after) for key, name, unit in zip(model.keys, model.names, model.units)
-    }
-    rows = [(*name_and_unit[key], column) for key, column in zip(keys, np.eye(len(keys)))]
-    names_present = {key if isinstance(key, str) else key[0] for key in keys}  # type: ignore[index]
-    units = dict(zip(after.model.names, after.model.units))
-    for name in dict.fromkeys(name for row in after.regrouping.values() for name in row if name not in names_present):
-        column = np.zeros(len(keys))
-        for key, row in after.regrouping.items():
-            column[keys.index(key)] = row.get(name, 0.0)
-        rows.append((name, units[name], column))
+    names_and_units = {}
+    for model in (before, after):
+        for key, name, unit in zip(model.keys, model.names, model.units):
+            names_and_units[key] = name, unit
+    rows = []
+    estimated = set()
+    for key, column in zip(keys, np.eye(len(keys))):
+        name, unit = names_and_units[key]
+        rows.append((name, unit, column))
+        if isinstance(key, tuple):
+            estimated.add(key[0])
+        else:
+            estimated.add(key)
+
+    unit_of = dict(zip(after.model.names, after.model.units))
+    regrouped: dict[str, np.ndarray] = {}
+    for key, coefficients in after.regrouping.items():
+        for name, coefficient in coefficients.items():
+            if name not in estimated:
+                column = regrouped.setdefault(name, np.zeros(len(keys)))
+                column[keys.index(key)] = coefficient
+    for name, column in regrouped.items():
+        rows.append((name, unit_of[name], column))
     return rows
 
 
-def _apart(columns: np.ndarray, first: int) -> list[int]:
+def _distinct(columns: np.ndarray, first: int) -> list[int]:
     """Return the columns (s, p) without those that another one's change would look like; the `first` ones are kept."""
     size = np.linalg.norm(columns, axis=0)
     unit = columns / np.where(size > 0.0, size, 1.0)
@@ -143,45 +171,55 @@ def _apart(columns: np.ndarray, first: int) -> list[int]:
 
 def _parts(test: Tested, arm: IdentificationModel, names: list[str], states: MotionStates) -> tuple[PartChange, ...]:
     """Return each joint's friction and each link's body with what it explains."""
-    column_of, result = {name: k for k, name in enumerate(arm.names)}, []
+    column_of = {name: k for k, name in enumerate(arm.names)}
+    result = []
     for part, members in {**_frictions(arm), **_links(arm)}.items():
         chosen = np.array([k for k, name in enumerate(names) if name in members], dtype=int)
-        if len(chosen):
-            steps, explained, count = test.together(chosen)
-            change = np.zeros(arm.p)
-            change[[column_of[names[k]] for k in chosen]] = steps[chosen]
-            result.append(PartChange(part, explained, count, _rms(arm.torque(change, *states.motion, ()))))
-    return tuple(sorted(result, key=lambda part_change: -part_change.explained))
+        if not len(chosen):
+            continue
+        steps, explained, count = test.together(chosen)
+        change = np.zeros(arm.p)
+        for k in chosen:
+            change[column_of[names[k]]] = steps[k]
+        torque = arm.torque(change, *states.motion, ())
+        result.append(PartChange(part, explained, count, _rms(torque)))
+    result.sort(key=lambda part: -part.explained)
+    return tuple(result)
 
 
 def _frictions(model: IdentificationModel) -> dict[str, set[str]]:
-    rows = range(model.n)
-    return {f"the friction of joint {j + 1}": {t.name for t in model.columns if t.acts[0][0] == j} for j in rows}
+    """Return the names of the drive terms by the joint whose friction they are."""
+    frictions: dict[str, set[str]] = {f"the friction of joint {j + 1}": set() for j in range(model.n)}
+    for term in model.columns:
+        part = f"the friction of joint {term.acts[0][0] + 1}"
+        if part in frictions:
+            frictions[part].add(term.name)
+    return frictions
 
 
 def _links(model: IdentificationModel) -> dict[str, set[str]]:
+    """Return the names of the ten inertial parameters of each link."""
     names = model.names[: model.inertial]
     return {f"the body of link {k // 10 + 1}": set(names[k : k + 10]) for k in range(0, len(names), 10)}
 
 
 def _torque(name: str, states: MotionStates, before: Identified, after: Identified) -> TorqueChange:
-    torque_before, torque_after = (
-        model.model.torque(model.dynamics.values, *states.motion, ()) for model in (before, after)
-    )
-    variances = [
-        parameter_variances(model.dynamics, model.columns, model.covariance, *states.motion, ())
-        for model in (before, after)
-    ]
-    unexplained, measured = None, states.measured
-    if measured is not None:
-        residual_percent = [
-            100.0 * float(np.linalg.norm(measured - model) / np.linalg.norm(measured))
-            for model in (torque_before, torque_after)
-        ]
-        unexplained = residual_percent[0], residual_percent[1]
-    return TorqueChange(
-        name, states.t, torque_after - torque_before, np.sqrt(np.add(*variances)), torque_after, unexplained
-    )
+    torques = []
+    variances = []
+    shares = []
+    for model in (before, after):
+        torque = model.model.torque(model.dynamics.values, *states.motion, ())
+        torques.append(torque)
+        variance = parameter_variances(model.dynamics, model.columns, model.covariance, *states.motion, ())
+        variances.append(variance)
+        if states.measured is not None:
+            residual = np.linalg.norm(states.measured - torque)
+            shares.append(100.0 * float(residual / np.linalg.norm(states.measured)))
+    unexplained = None
+    if shares:
+        unexplained = shares[0], shares[1]
+    expected = np.sqrt(variances[0] + variances[1])
+    return TorqueChange(name, states.t, torques[1] - torques[0], expected, torques[1], unexplained)
 
 
 def _rms(values: np.ndarray) -> float:

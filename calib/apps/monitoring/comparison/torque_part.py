@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -15,6 +15,17 @@ from calib.toolkit.report_pages import Block, RecordColumn, Text, table
 
 if TYPE_CHECKING:
     from calib.toolkit.report_charts import Chart
+
+
+class _TorqueRow(NamedTuple):
+    """The change of one torque row over one motion, rms and worst [N m or N]."""
+
+    motion: str
+    name: str
+    change: float
+    expected: float
+    worst: float
+    torque: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,14 +41,16 @@ class TorquePart(ChangePart):
     @cached_property
     def judged(self) -> TorqueChange:
         """The motion that `today` rests on: of those measured for the later model the worst."""
-        measured_changes = [
+        measured = [
             change for change in self.found.torques if change.unexplained and change.where in self.after.motions
         ]
-        return max(measured_changes or self.found.torques, key=lambda change: (change.unexplained or (0.0,))[0])
+        return max(measured or self.found.torques, key=_unexplained_before)
 
     @property
     def today(self) -> float:
-        return self.judged.unexplained[0] if self.judged.unexplained else np.nan
+        if self.judged.unexplained is None:
+            return np.nan
+        return self.judged.unexplained[0]
 
     @property
     def words(self) -> str:
@@ -56,46 +69,61 @@ class TorquePart(ChangePart):
     def shown(self, value: float) -> str:
         return f"{value:.3g} %"
 
-    def own_findings(self) -> list[Finding]:
-        change_test, change, result = self.found, self.judged, list[Finding]()
+    def specific_findings(self) -> list[Finding]:
+        test = self.found
+        change = self.judged
+        residual = 0.0
+        if change.unexplained:
+            residual = 1e-2 * min(change.unexplained) * _rms(change.torque)
+        ratio = change.rms / max(residual, 1e-12)
+        beyond = ratio
+        result: list[Finding] = []
         if self.tolerance:
+            # Whether the change matters is then said by the tolerance.
+            beyond = 0.0
             times = self.today / self.tolerance
             result.append(finding("model-outgrown", times=times, today=self.today, after=self.after.name))
-        residual_torque = 1e-2 * min(change.unexplained) * _rms(change.torque) if change.unexplained else 0.0
-        ratio = change.rms / max(residual_torque, 1e-12)
+        hidden_by = None
+        if ratio <= 1.0:
+            hidden_by = residual
         result.append(
             finding(
                 "dynamics-changed",
-                sigmas=change_test.sigmas,
-                beyond=0.0 if self.tolerance else ratio,
+                sigmas=test.sigmas,
+                beyond=beyond,
                 unit=self.unit,
-                probability=change_test.probability,
-                left=residual_torque if ratio <= 1.0 else None,
+                probability=test.probability,
+                left=hidden_by,
             )
         )
-        if change_test.changed and not change_test.alone and change_test.part:
-            part = change_test.part
-            result.append(
-                finding(
-                    "part-changed",
-                    name=part.name,
-                    share=part.explained / change_test.chi2,
-                    rms=part.rms,
-                    unit=self.unit,
-                )
-            )
+        part = test.part
+        if test.changed and not test.alone and part:
+            share = part.explained / test.chi2
+            result.append(finding("part-changed", name=part.name, share=share, rms=part.rms, unit=self.unit))
         return result
 
     def blocks(self) -> list[Block]:
-        unit, names = self.unit, self.after.rows
-        rows = [(change, j) for change in self.found.torques for j in range(len(names))]
+        unit = self.unit
+        rows = []
+        for change in self.found.torques:
+            for j, name in enumerate(self.after.rows):
+                rows.append(
+                    _TorqueRow(
+                        motion=change.where,
+                        name=name,
+                        change=_rms(change.change[:, j]),
+                        expected=_rms(change.expected[:, j]),
+                        worst=np.abs(change.change[:, j]).max(),
+                        torque=_rms(change.torque[:, j]),
+                    )
+                )
         torques = [
-            RecordColumn("motion", lambda row: row[0].where, number=False),
-            RecordColumn("torque of", lambda row: names[row[1]], number=False),
-            RecordColumn(f"change rms {unit}", lambda row: f"{_rms(row[0].change[:, row[1]]):.3g}"),
-            RecordColumn("σ of that", lambda row: f"{_rms(row[0].expected[:, row[1]]):.2g}"),
-            RecordColumn("worst", lambda row: f"{np.abs(row[0].change[:, row[1]]).max():.3g}"),
-            RecordColumn("torque rms", lambda row: f"{_rms(row[0].torque[:, row[1]]):.3g}"),
+            RecordColumn("motion", "{0.motion}", number=False),
+            RecordColumn("torque of", "{0.name}", number=False),
+            RecordColumn(f"change rms {unit}", "{0.change:.3g}"),
+            RecordColumn("σ of that", "{0.expected:.2g}"),
+            RecordColumn("worst", "{0.worst:.3g}"),
+            RecordColumn("torque rms", "{0.torque:.3g}"),
         ]
         parts = [
             RecordColumn("part", "{0.name}", number=False),
@@ -119,25 +147,37 @@ class TorquePart(ChangePart):
     def charts(self) -> dict[str, Chart]:
         from calib.toolkit.report_charts import AFTER, QUIET, Chart, Panel, line
 
-        change, panels = self.judged, []
+        change = self.judged
+        panels = []
         for j, name in enumerate(self.after.rows):
-            band = [line(change.t, sign * 2.0 * change.expected[:, j], "--", QUIET, 0.6) for sign in (-1.0, 1.0)]
-            lines = [line(change.t, change.change[:, j], "-", AFTER, 0.7), *band]
-            panels.append(Panel(lines, f"{name} [{self.unit}]", "time [s]", xlim=(change.t[0], change.t[-1])))
-        return {"torque": Chart(panels, 0.7 + 0.95 * -(-len(panels) // 2), 2, title=change.where, shared="x")}
+            two_sigmas = 2.0 * change.expected[:, j]
+            layers = [
+                line(change.t, change.change[:, j], "-", AFTER, 0.7),
+                line(change.t, -two_sigmas, "--", QUIET, 0.6),
+                line(change.t, two_sigmas, "--", QUIET, 0.6),
+            ]
+            panels.append(Panel(layers, f"{name} [{self.unit}]", "time [s]", xlim=(change.t[0], change.t[-1])))
+        rows_of_panels = -(-len(panels) // 2)
+        return {"torque": Chart(panels, 0.7 + 0.95 * rows_of_panels, 2, title=change.where, shared="x")}
 
     def numbers(self) -> dict[str, object]:
-        torques = {
-            one.where: {
-                "rms": one.rms,
-                "expected": _rms(one.expected),
-                "unexplained_percent": one.unexplained,
-                "by_row": [_rms(column) for column in one.change.T],
+        torques = {}
+        for change in self.found.torques:
+            torques[change.where] = {
+                "rms": change.rms,
+                "expected": _rms(change.expected),
+                "unexplained_percent": change.unexplained,
+                "by_row": [_rms(column) for column in change.change.T],
             }
-            for one in self.found.torques
-        }
-        parts = [{"name": one.name, "explained": one.explained, "rms": one.rms} for one in self.found.parts]
+        parts = [{"name": part.name, "explained": part.explained, "rms": part.rms} for part in self.found.parts]
         return {"torques": torques, "parts": parts}
+
+
+def _unexplained_before(change: TorqueChange) -> float:
+    """Return the share [%] that the earlier model leaves unexplained; 0 where no torque was measured."""
+    if change.unexplained is None:
+        return 0.0
+    return change.unexplained[0]
 
 
 def _rms(values: np.ndarray) -> float:

@@ -17,13 +17,21 @@ from calib.procedure.report.page import Block, FileRow, KeyFigure, ReportTable, 
 from calib.procedure.report.templates import issued
 
 MAX_PAGES = 4
-MAX_REASON = 420  # letters of a verdict's reason on the certificate
-MAX_LINE = 260  # letters of a sentence there
-MAX_LINES = 8  # sentences of one kind there
-MAX_FILES = 12  # files listed there
-MAX_VALUE = 90  # letters of what a setup line says there
-DIGEST_DIGITS = 16  # hexadecimal digits of a SHA-256 there
-KNOWN = (
+# Bounds of the certificate; the report has the whole.
+# letters of a verdict's reason
+MAX_REASON = 420
+# letters of a sentence
+MAX_LINE = 260
+# sentences of one kind
+MAX_LINES = 8
+# files listed
+MAX_FILES = 12
+# letters of what a setup line says
+MAX_VALUE = 90
+# hexadecimal digits of a SHA-256
+DIGEST_DIGITS = 16
+# lines of the setup that a certificate states
+CERTIFIED_SETUP = (
     "robot",
     "description",
     "instrument",
@@ -37,7 +45,7 @@ KNOWN = (
     "friction",
 )
 EDITED = "edited by hand"
-WHOLE = "report.html"
+REPORT = "report.html"
 CONVENTIONS = (
     "Units: m, rad, s, kg, N·m in all files unless a header names another; this page prints mm, deg and mrad.",
     "Modified Denavit-Hartenberg rows (Khalil and Kleinfinger): Rot_x(alpha) Trans_x(d) Trans_z(r) Rot_z(theta + q).",
@@ -78,11 +86,11 @@ class Page:
 
 @dataclass(frozen=True)
 class Judgement:
-    """A verdict: on what, its level and the word for it, and the reason as a sentence."""
+    """A verdict: on what, its level and the label for it, and the reason as a sentence."""
 
     title: str
     level: str
-    word: str
+    label: str
     reason: str
 
 
@@ -94,9 +102,9 @@ class Certificate(Page):
         number: its number.
         alert: what has to be known first: that it is simulated.
         verdicts: one of each stage.
-        asked: tolerance asked and met, for each quantity and deliverable.
-        known: what the data say of robot, instrument and method.
-        stated: what a person says beside that, and lines to fill in.
+        tolerances: tolerance asked and met, for each quantity and deliverable.
+        setup: what the data say of robot, instrument and method.
+        details: what a person says beside that, and lines to fill in.
         signatures: who signs, and what else is written there.
         sections: one a page, with the blocks of the certificate.
     """
@@ -104,9 +112,9 @@ class Certificate(Page):
     number: Entry
     alert: str
     verdicts: Sequence[Judgement]
-    asked: ReportTable
-    known: Sequence[Entry]
-    stated: Sequence[Entry]
+    tolerances: ReportTable
+    setup: Sequence[Entry]
+    details: Sequence[Entry]
     signatures: Sequence[str]
 
 
@@ -140,63 +148,95 @@ def records(
     """Return certificate and report of a calibration.
 
     Args:
-        setup: what was calibrated, with what and how; the certificate states `KNOWN` of it.
+        setup: what was calibrated, with what and how; the certificate states `CERTIFIED_SETUP` of it.
         unchecked: what was not checked besides what the stages say.
         files: what it rests on, see `calib.procedure.report.fit_report.file_row`; the most important ones first.
         details: what a person says beside the data.
         alert: what has to be known first.
     """
-    sections, about = [one.section for one in stages], described(CertificateSection)
-    number, *stated = (Entry(about[one.name], str(getattr(details, one.name))) for one in fields(details))
-    known = [Entry(one.label, shortened(_local(one.value), MAX_VALUE)) for one in setup if one.label in KNOWN]
-    last = [
-        Text("NOT checked", [*unchecked, *(line for one in stages for line in one.unchecked)]),
-        Text("Findings", [line for one in stages for line in one.findings]),
-        files_table(files, MAX_FILES),
-        *NOTES,
-    ]
-    sheets = [*((one.section.title, one.sheet) for one in stages), ("Validity", last)]
-    shown = [Section(name, [_cut(one) if isinstance(one, Text) else one for one in blocks]) for name, blocks in sheets]
-    return Certificate(
-        "Calibration certificate",
-        title,
-        subtitle,
-        f"issued {issued()}",
-        shown,
-        number,
-        alert,
-        [judgement(one, MAX_REASON) for one in sections if one.verdict],
-        key_table(sections),
-        known,
-        stated,
-        ("Calibrated by", "Date", "Signature", "Checked by", "Date", "Signature"),
-    ), report(title, f"{f'{alert}; ' if alert else ''}{subtitle}", setup, sections, files)
+    certified = []
+    for entry in setup:
+        if entry.label in CERTIFIED_SETUP:
+            value = shortened(_local(entry.value), MAX_VALUE)
+            certified.append(Entry(entry.label, value))
+    # the first detail is the certificate's number
+    labels = described(CertificateSection)
+    number, *stated_details = (
+        Entry(labels[field.name], str(getattr(details, field.name))) for field in fields(details)
+    )
+
+    sections = [stage.section for stage in stages]
+    unchecked, findings = list(unchecked), []
+    pages = []
+    for stage in stages:
+        unchecked += stage.unchecked
+        findings += stage.findings
+        pages.append(_certificate_page(stage.section.title, stage.sheet))
+    validity = [Text("NOT checked", unchecked), Text("Findings", findings), files_table(files, MAX_FILES), *NOTES]
+    pages.append(_certificate_page("Validity", validity))
+    certificate = Certificate(
+        kind="Calibration certificate",
+        title=title,
+        subtitle=subtitle,
+        issued=f"issued {issued()}",
+        sections=pages,
+        number=number,
+        alert=alert,
+        verdicts=[judgement(section, MAX_REASON) for section in sections if section.verdict],
+        tolerances=key_table(sections),
+        setup=certified,
+        details=stated_details,
+        signatures=("Calibrated by", "Date", "Signature", "Checked by", "Date", "Signature"),
+    )
+    if alert:
+        subtitle = f"{alert}; {subtitle}"
+    return certificate, report(title, subtitle, setup, sections, files)
 
 
-def judgement(section: Section, most: int | None = None) -> Judgement:
-    """Return the verdict of a section, its reason cut at `most` letters."""
-    level, reason = section.verdict, f"{section.reason[:1].upper()}{section.reason[1:]}."
-    word = level.replace("pass", "PASS") if "(" in level else level.upper()
-    return Judgement(section.title, level, word, shortened(_local(reason), most) if most else reason)
+def _certificate_page(title: str, blocks: Sequence[Block]) -> Section:
+    """Return a page of a certificate, its texts cut."""
+    return Section(title, [_cut(block) if isinstance(block, Text) else block for block in blocks])
+
+
+def judgement(section: Section, max_letters: int | None = None) -> Judgement:
+    """Return the verdict of a section, its reason cut at `max_letters`."""
+    level = section.verdict
+    label = level.upper()
+    if "(" in level:
+        # what stands in brackets keeps its letters
+        label = level.replace("pass", "PASS")
+    reason = f"{section.reason[:1].upper()}{section.reason[1:]}."
+    if max_letters is not None:
+        reason = shortened(_local(reason), max_letters)
+    return Judgement(section.title, level, label, reason)
 
 
 def key_table(sections: Sequence[Section]) -> ReportTable:
     """Return the table of what verdicts rest on: before, after, tolerance asked, and whether it is met."""
     header = ("quantity", "nominal", "after", "standard error", "on", "tolerance asked", "met")
-    rows = [row for one in sections if one.figures for row in ((one.title,), *map(_cells, one.figures))]
-    judged = frozenset(k for k, row in enumerate(rows) if len(row) > 1 and row[5] != "–")
-    return ReportTable("Tolerance asked and met", header, rows, strong=judged, numbers=(1, 2, 3, 5))
+    rows, with_tolerance = [], set()
+    for section in sections:
+        if section.figures:
+            rows.append((section.title,))
+        for figure in section.figures:
+            if figure.allowed and figure.allowed != "–":
+                with_tolerance.add(len(rows))
+            rows.append(_cells(figure))
+    return ReportTable("Tolerance asked and met", header, rows, strong=frozenset(with_tolerance), numbers=(1, 2, 3, 5))
 
 
-def _cells(one: KeyFigure) -> tuple[str, ...]:
-    return one.quantity, one.before or "–", one.after, one.spread, one.basis, one.allowed or "–", one.met or "–"
+def _cells(figure: KeyFigure) -> tuple[str, ...]:
+    before, allowed, met = figure.before or "–", figure.allowed or "–", figure.met or "–"
+    return figure.quantity, before, figure.after, figure.spread, figure.basis, allowed, met
 
 
 def _cut(block: Text) -> Text:
     """Return a text of a certificate with at most `MAX_LINES` sentences of `MAX_LINE` letters; the report has all."""
-    lines = [shortened(_local(line), MAX_LINE) for line in block.lines]
-    more = [f"{len(lines) - MAX_LINES + 1} more: see {WHOLE}."] if len(lines) > MAX_LINES else []
-    return Text(block.title, [*lines[: MAX_LINES - len(more)], *more])
+    lines = [shortened(_local(str(line)), MAX_LINE) for line in block.lines]
+    if len(lines) > MAX_LINES:
+        count = len(lines) - MAX_LINES + 1
+        lines = [*lines[: MAX_LINES - 1], f"{count} more: see {REPORT}."]
+    return Text(block.title, lines)
 
 
 def _local(text: str) -> str:
@@ -204,13 +244,18 @@ def _local(text: str) -> str:
     return re.sub(r"(?<![\w.~/])/(?:[^/\s]+/)+(?=[^/\s])", "", text)
 
 
-def files_table(files: Sequence[FileRow], most: int | None = None) -> ReportTable:
-    """Return the table of files with their SHA-256, those edited by hand first; at most `most`, with short ones."""
-    if most is None:
+def files_table(files: Sequence[FileRow], max_files: int | None = None) -> ReportTable:
+    """Return the table of files with their SHA-256; of at most `max_files`, edited ones first, with short digests."""
+    if max_files is None:
         return ReportTable("", ("file", "what it is", "bytes", "SHA-256"), files, numbers=(2,))
-    first = sorted(files, key=lambda row: row[1] != EDITED)  # what was edited by hand is not hidden among the rest
-    rows = [(name, role, f"{digest[:DIGEST_DIGITS]}…") for name, role, _, digest in first[:most]]
-    note = f"{len(files) - most} more, and whole digests: see {WHOLE}." if len(files) > most else ""
+    # what was edited by hand is not hidden among the others
+    edited_first = sorted(files, key=lambda row: row[1] != EDITED)
+    rows = []
+    for name, role, _, digest in edited_first[:max_files]:
+        rows.append((name, role, f"{digest[:DIGEST_DIGITS]}…"))
+    note = ""
+    if len(files) > max_files:
+        note = f"{len(files) - max_files} more, and whole digests: see {REPORT}."
     return ReportTable("Files", ("file", "what it is", "SHA-256"), rows, note)
 
 
@@ -218,13 +263,14 @@ def report(
     title: str, subtitle: str, setup: Sequence[Entry], sections: Sequence[Section], files: Sequence[FileRow] = ()
 ) -> Page:
     """Return the record of a report: verdicts, all sections, setup, files, conventions."""
-    judged = [one for one in map(judgement, sections) if one.level]
-    reasons = Text("Verdict", [f"{one.title}: {one.word}. {one.reason}" for one in judged])
-    behind = [Section("Result", [reasons, key_table(sections)]), *sections]
+    verdicts = [judgement(section) for section in sections if section.verdict]
+    reasons = [f"{verdict.title}: {verdict.label}. {verdict.reason}" for verdict in verdicts]
+    report_sections = [Section("Result", [Text("Verdict", reasons), key_table(sections)]), *sections]
     if setup:
-        rows = [(one.label, one.value) for one in setup]
-        behind.append(Section("Setup", [ReportTable("", ("what", "value"), rows)]))
+        rows = [(entry.label, entry.value) for entry in setup]
+        report_sections.append(Section("Setup", [ReportTable("", ("what", "value"), rows)]))
     if files:
-        behind.append(Section("Files", [files_table(files)]))
-    behind.append(Section("Limitations and conventions", NOTES))
-    return Page("Calibration report", title, subtitle, issued(), [one for one in behind if any(map(len, one.blocks))])
+        report_sections.append(Section("Files", [files_table(files)]))
+    report_sections.append(Section("Limitations and conventions", NOTES))
+    filled = [section for section in report_sections if any(len(block) for block in section.blocks)]
+    return Page("Calibration report", title, subtitle, issued(), filled)

@@ -7,7 +7,7 @@ computer's own fonts are looked through only for letters that it lacks.
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,16 +20,17 @@ from calib.procedure.report.page import Pictures
 from calib.procedure.report.templates import filled, read
 from calib.records import plain
 
-HERE = "calib.procedure.report.certificate"
+PACKAGE = "calib.procedure.report.certificate"
 FONT = "DejaVu Sans"
-OURS = str(Path(find_spec("matplotlib").origin or "").parent / "mpl-data/fonts/ttf")  # type: ignore[union-attr]
-STANDARD = "a-2b"  # refuses letters that no font shows
+FONT_FOLDER = str(Path(find_spec("matplotlib").origin or "").parent / "mpl-data/fonts/ttf")  # type: ignore[union-attr]
+# refuses letters that no font shows
+STANDARD = "a-2b"
 
 
-def write(folder: Path, one: Certificate, whole: Page) -> list[str]:
+def write(folder: Path, certificate: Certificate, report: Page) -> list[str]:
     """Write a certificate as HTML and PDF and the report into a folder; return what there is to say."""
-    made, notes = pdf(one)
-    for name, content in zip(PAGES, (html(one), made, html(whole))):
+    document, notes = pdf(certificate)
+    for name, content in zip(PAGES, (html(certificate), document, html(report))):
         if content:
             files.write(folder / name, content)
         else:
@@ -43,16 +44,21 @@ def write_figures(folder: Path, page: Page) -> int:
 
     count = 0
     for section in page.sections:
-        drawn = [one for block in section.blocks if isinstance(block, Pictures) for one in block.pictures]
-        for number, one in enumerate(drawn, 1):
-            files.write(folder / f"{section.title.lower()}_{number}.svg", vector(one.chart, one.caption).image)
-        count += len(drawn)
+        pictures = []
+        for block in section.blocks:
+            if isinstance(block, Pictures):
+                pictures += block.pictures
+        for number, picture in enumerate(pictures, 1):
+            image = vector(picture.chart, picture.caption).image
+            files.write(folder / f"{section.title.lower()}_{number}.svg", image)
+        count += len(pictures)
     return count
 
 
 def html(page: Page) -> str:
     """Return a certificate or report as HTML."""
-    return filled(HERE, "sheet.html" if isinstance(page, Certificate) else "report.html", page=page)
+    template = "sheet.html" if isinstance(page, Certificate) else "report.html"
+    return filled(PACKAGE, template, page=page)
 
 
 def pdf(page: Certificate) -> tuple[bytes, list[str]]:
@@ -65,16 +71,20 @@ def pdf(page: Certificate) -> tuple[bytes, list[str]]:
         return b"", [f"{PAGES[1]} was not written, since this process was forked: start processes by spawn"]
     images: dict[str, bytes] = {}
 
-    def named(value: bytes | Iterable[object]) -> object:
+    def as_json(value: Any) -> object:
         if not isinstance(value, bytes):
             return list(value)
-        images[f"{len(images)}.svg"] = value
-        return f"{len(images) - 1}.svg"
+        name = f"{len(images)}.svg"
+        images[name] = value
+        return name
 
-    content = json.dumps(plain(page), default=named)
-    given = {"main.typ": read(HERE, "sheet.typ").encode(), "page.json": content.encode(), **images}
-    made, notes = _typeset(given, dense=False)
-    return (made, notes) if pages(made) <= MAX_PAGES else _typeset(given, dense=True)
+    content = json.dumps(plain(page), default=as_json)
+    template = read(PACKAGE, "sheet.typ")
+    inputs = {"main.typ": template.encode(), "page.json": content.encode(), **images}
+    document, notes = _typeset(inputs, dense=False)
+    if pages(document) > MAX_PAGES:
+        return _typeset(inputs, dense=True)
+    return document, notes
 
 
 @cache
@@ -87,18 +97,20 @@ def pages(document: bytes) -> int:
     return len(re.findall(rb"/Type\s*/Page\b", document))
 
 
-def _typeset(given: Mapping[str, bytes], dense: bool) -> tuple[bytes, list[str]]:
+def _typeset(inputs: Mapping[str, bytes], dense: bool) -> tuple[bytes, list[str]]:
     """Return the PDF of a template and its files, and a note on letters that no font has."""
     import typst  # 80 MB, and needed for nothing else
 
     notes: list[str] = []
     for families, standard in _fonts():
         setting = json.dumps({"fonts": families, "dense": dense}).encode()
+        all_inputs: Any = {**inputs, "setting.json": setting}
+        own_font = families == [FONT]
         try:
-            files: dict[str, bytes] = {**given, "setting.json": setting}
-            ours = families == [FONT]
-            made: Any = typst.compile(files, font_paths=[OURS], ignore_system_fonts=ours, pdf_standards=standard)
-            return made, notes
+            document: Any = typst.compile(
+                all_inputs, font_paths=[FONT_FOLDER], ignore_system_fonts=own_font, pdf_standards=standard
+            )
+            return document, notes
         except typst.TypstError as error:
             lacking = re.search('the text `"(.*)"` could not be displayed', str(error))
             if lacking is None or not standard:
@@ -112,6 +124,7 @@ def _fonts() -> Iterator[tuple[list[str], Any]]:
     import typst
 
     yield [FONT], STANDARD
-    every = [FONT, *typst.Fonts(include_system_fonts=True, include_embedded_fonts=True).families()]
-    yield every, STANDARD
-    yield every, None
+    installed = typst.Fonts(include_system_fonts=True, include_embedded_fonts=True).families()
+    families = [FONT, *installed]
+    yield families, STANDARD
+    yield families, None

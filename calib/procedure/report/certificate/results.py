@@ -20,13 +20,15 @@ if TYPE_CHECKING:
     from calib.procedure.report.fit_report import Report
 
 
-def write_fit(found: Report, drawn: Mapping[str, Picture], folder: Path) -> None:
+def write_fit(fit_report: Report, drawn: Mapping[str, Picture], folder: Path) -> None:
     """Write certificate and report of a fit into its folder.
 
     Args:
+        fit_report: of the fit.
         drawn: the report's figures by name; without any, the certificate has none either.
+        folder: of the fit.
     """
-    rendering.write(folder, *of_fit(found, drawn))
+    rendering.write(folder, *of_fit(fit_report, drawn))
 
 
 def read_fit(folder: Path, plots: bool, details: CertificateSection) -> tuple[Certificate, Page]:
@@ -34,97 +36,111 @@ def read_fit(folder: Path, plots: bool, details: CertificateSection) -> tuple[Ce
     from calib.procedure.kinematic_stage.folder import FitFolder
     from calib.procedure.report import fit_report
 
-    found, drawn = fit_report.read(FitFolder(folder).report), {}
+    fit = fit_report.read(FitFolder(folder).report)
+    drawn = {}
     if plots:
         from calib.procedure.report.charts import pictures
         from calib.procedure.report.geometry_figures import captioned
 
-        drawn = pictures(captioned(found))
-    return of_fit(found, drawn, details)
+        drawn = pictures(captioned(fit))
+    return of_fit(fit, drawn, details)
 
 
 def of_fit(
-    found: Report, drawn: Mapping[str, Picture], details: CertificateSection = NO_DETAILS
+    fit_report: Report, drawn: Mapping[str, Picture], details: CertificateSection = NO_DETAILS
 ) -> tuple[Certificate, Page]:
     """Return certificate and report of a fit."""
     from calib.procedure.report.certificate import geometry  # slow to load, as all that belongs to a fit
 
-    metrics, title = found.metrics, f"Calibration of {found.robot}"
-    measured = ", ".join(name for name, role, *_ in found.files if role != "nominal robot")
+    robot, metrics = fit_report.robot, fit_report.metrics
+    measurements = [name for name, role, *_ in fit_report.files if role != "nominal robot"]
+    links = f"{fit_report.base} to {fit_report.tip}"
     setup = [
-        Entry("robot", f"{found.robot}, {found.base} to {found.tip}, {len(found.joints)} joints"),
-        Entry("description", found.source),
-        Entry("measurements", measured),
+        Entry("robot", f"{robot}, {links}, {len(fit_report.joints)} joints"),
+        Entry("description", fit_report.source),
+        Entry("measurements", ", ".join(measurements)),
         Entry("model", metrics.model),
         Entry("measured range", measured_range(metrics)),
         Entry("tolerance", tolerance(metrics.tolerance_mm, metrics)),
         Entry("seed", str(metrics.seed)),
         Entry("toolkit", versions()),
     ]
-    stages, unchecked = [geometry.stage(found, drawn)], ["dynamics: not identified"]
-    return records(title, "Geometry", setup, stages, unchecked, found.files, details)
+    stages = [geometry.stage(fit_report, drawn)]
+    unchecked = ["dynamics: not identified"]
+    return records(f"Calibration of {robot}", "Geometry", setup, stages, unchecked, fit_report.files, details)
 
 
-def tolerance(millimetres: float | None, found: FitMetrics) -> str:
+def tolerance(millimetres: float | None, metrics: FitMetrics) -> str:
     """Return a text on the condition for verdict pass, and on the deliverable to which it applies."""
     from calib.procedure.kinematic_stage.validation import ARM
 
-    of = f"; judged: {ARM[found.deliverable]}" if len(found.deliverables) > 1 else ""
-    if not millimetres:
-        return f"none given: pass means better than the nominal robot on unseen poses, or no improvement possible{of}"
-    return f"{millimetres:g} mm rms on unseen poses{of}"
+    condition = "none given: pass means better than the nominal robot on unseen poses, or no improvement possible"
+    if millimetres:
+        condition = f"{millimetres:g} mm rms on unseen poses"
+    if len(metrics.deliverables) > 1:
+        condition += f"; judged: {ARM[metrics.deliverable]}"
+    return condition
 
 
-def measured_range(found: FitMetrics) -> str:
+def measured_range(metrics: FitMetrics) -> str:
     """Return a text on the joint range that the verdict on a fit is about; empty for fits of earlier versions."""
-    held = None if found.findings is None else found.findings.joint_range
-    if held is None:
+    joint_range = None if metrics.findings is None else metrics.findings.joint_range
+    if joint_range is None:
         return ""
-    values = zip(held.lower, held.upper, held.units)
-    scaled = [(low, high, *((1e3, " mm") if unit == "m" else (1.0 / DEG, "°"))) for low, high, unit in values]
-    return ", ".join(f"{round(factor * low)}…{round(factor * high)}{shown}" for low, high, factor, shown in scaled)
+    texts = []
+    for low, high, unit in zip(joint_range.lower, joint_range.upper, joint_range.units):
+        factor, printed_unit = 1.0 / DEG, "°"
+        if unit == "m":
+            factor, printed_unit = 1e3, " mm"
+        texts.append(f"{round(factor * low)}…{round(factor * high)}{printed_unit}")
+    return ", ".join(texts)
 
 
-def write_model(found: DynamicReport, drawn: Mapping[str, Picture], folder: Path) -> None:
+def write_model(model_report: DynamicReport, drawn: Mapping[str, Picture], folder: Path) -> None:
     """Write certificate and report of an identification into its folder.
 
     Args:
+        model_report: of the identification.
         drawn: the report's figures by name; without any, the certificate has none either.
+        folder: of the identification.
     """
-    rendering.write(folder, *of_model(found, drawn))
+    rendering.write(folder, *of_model(model_report, drawn))
 
 
 def read_model(folder: Path, plots: bool, details: CertificateSection) -> tuple[Certificate, Page]:
     """Return certificate and report of the identification in a folder."""
     from calib.procedure.report import dynamics_section
 
-    found, drawn = dynamics_section.read(folder), {}
+    model_report = dynamics_section.read(folder)
+    drawn = {}
     if plots:
         from calib.procedure.report.charts import pictures
         from calib.procedure.report.dynamics_figures import captioned
 
-        drawn = pictures(captioned(found, folder))
-    return of_model(found, drawn, details)
+        drawn = pictures(captioned(model_report, folder))
+    return of_model(model_report, drawn, details)
 
 
 def of_model(
-    found: DynamicReport, drawn: Mapping[str, Picture], details: CertificateSection = NO_DETAILS
+    model_report: DynamicReport, drawn: Mapping[str, Picture], details: CertificateSection = NO_DETAILS
 ) -> tuple[Certificate, Page]:
     """Return certificate and report of an identification."""
     from calib.procedure.report import dynamics_section
     from calib.procedure.report.certificate import dynamics
 
-    unseen, metrics = found.unseen, found.metrics
+    unseen, metrics = model_report.unseen, model_report.metrics
+    recordings = ", ".join((*unseen.fit, *unseen.validation))
     setup = [
         Entry("robot", unseen.robot),
-        Entry("recordings", ", ".join((*unseen.fit, *unseen.validation))),
+        Entry("recordings", recordings),
         Entry("torques", f"{len(unseen.rows)} rows"),
         Entry("method", metrics.method),
         Entry("friction", metrics.friction),
         Entry("seed", str(metrics.seed)),
         Entry("toolkit", versions()),
     ]
-    stages = [dynamics.stage(found, dynamics_section.report_section(found, drawn), bool(drawn))]
+    section = dynamics_section.report_section(model_report, drawn)
+    stages = [dynamics.stage(model_report, section, bool(drawn))]
     unchecked = ["geometry: taken as described"]
     return records(f"Calibration of {unseen.robot}", "Dynamics", setup, stages, unchecked, details=details)
 
@@ -141,5 +157,7 @@ def notebook(result: SectionResult) -> str:
     from calib.procedure.report import fit_report
 
     if isinstance(result, Outcome):
-        return rendering.html(replace(of_fit(fit_report.collect(result), {})[0], sections=()))
-    return rendering.html(report(repr(result).strip("<>"), "", (), [result.section()]))
+        certificate, _ = of_fit(fit_report.collect(result), {})
+        return rendering.html(replace(certificate, sections=()))
+    page = report(repr(result).strip("<>"), "", (), [result.section()])
+    return rendering.html(page)

@@ -16,12 +16,13 @@ from calib.procedure.findings import PREDICTION_ONLY
 from calib.procedure.report import page
 from calib.procedure.report.certificate import rendering
 from calib.procedure.report.certificate.record import (  # fmt: skip
-    KNOWN,
+    CERTIFIED_SETUP,
     MAX_LINES,
     MAX_PAGES,
     NO_DETAILS,
     Certificate,
     Entry,
+    Judgement,
     StageRecord,
     records,
     report,
@@ -93,13 +94,13 @@ def said(value: object) -> list[str]:
         return [re.sub(r"[\s\u200b]", "", value)]
     if isinstance(value, Picture):
         return said(value.caption)
+    if isinstance(value, Judgement):
+        return said([value.title, value.label, value.reason])
     if isinstance(value, ReportTable | Text | Pictures | Section | Certificate) or hasattr(value, "label"):
         hidden = {"kind", "strong", "numbers", "figures", "verdict", "reason"}
         if not isinstance(value, Certificate) and hasattr(value, "kind") and not len(value):  # type: ignore[arg-type]
             return []
         return [text for name, one in vars(value).items() if name not in hidden for text in said(one)]
-    if hasattr(value, "word"):
-        return said([value.title, value.word, value.reason])  # type: ignore[attr-defined]
     return [text for one in value for text in said(one)] if isinstance(value, list | tuple) else []
 
 
@@ -146,7 +147,7 @@ def test_pdf_and_html_say_what_the_record_says(verdict):
     assert [text for text in expected if text not in in_document and text.upper() not in in_document] == []
     assert not notes and "None" not in on_page
     word = "PASS (prediction only)" if verdict == PREDICTION_ONLY else verdict.upper()
-    assert one.verdicts[0].word == word
+    assert one.verdicts[0].label == word
 
 
 def test_the_report_has_a_table_of_contents_and_all_of_it():
@@ -176,7 +177,7 @@ def test_paths_of_this_machine_stay_in_the_report():
         judged(blocks=[Text("Findings", [line])]), known=[Entry("description", "/home/someone/robot.urdf")]
     )
     assert one.sections[0].blocks[0].lines == ["validation.csv: 5 rows; see ~/notes.txt, 3-measured/a.csv and m/s"]
-    assert one.known == [Entry("description", "robot.urdf")]
+    assert one.setup == [Entry("description", "robot.urdf")]
 
 
 @pytest.mark.parametrize("entry", ["", "W" * MAX_LETTERS, "🤖 漢字 " * 28, "مستشعر الليزر " * 14, "שלום-SN-123 " * 16])
@@ -188,7 +189,7 @@ def test_any_entries_leave_at_most_four_pages(entry):
     text, pictures = Text("Findings", ["f " * 200] * 30), Pictures("", [Picture(SVG, "c" * 200, True)] * 2)
     sections = [replace(judged(reason="r " * 400, blocks=[table, pictures, text]), title=name) for name in ("A", "B")]
     sections = [replace(one, figures=[*one.figures] * 8) for one in sections]
-    known = [Entry(label, entry or "value") for label in KNOWN]
+    known = [Entry(label, entry or "value") for label in CERTIFIED_SETUP]
     lines = ["f " * 200] * 30
     one = certificate_of(*sections, details=details, known=known, files=FILES, findings=lines, alert="a" * 200)
     document, _ = rendering.pdf(one)

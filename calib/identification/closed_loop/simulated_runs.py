@@ -1,0 +1,113 @@
+"""Simulated runs of recordings' closed loops: of a regular robot to start from, of robots between two estimates.
+
+How far a run stays from the recorded motion says what the simulation is worth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calib.dynamics.drives import DriveTerm, standard
+from calib.dynamics.idim import IdentificationModel
+from calib.errors import CalibError, CannotSimulate, UsageError
+from calib.estimation.whiteness import inflation
+from calib.identification.closed_loop.loop_recordings import Loop, low_passed, simulated_samples
+from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun, plant_of
+from calib.identification.rows import Case
+from calib.records import frozen
+
+# halvings of a step to parameters that cannot be simulated (our choice)
+MAX_RETREATS = 6
+# of distances from the reference, recorded and simulated: beyond, gains are others (our choice)
+MAX_GAIN_RATIO = 1.25
+
+# each recording with its loop, and the run of that
+Runs = list[tuple[tuple[Case, Loop], SimulatedRun]]
+
+
+def regular_plant(
+    model: IdentificationModel, terms: Sequence[DriveTerm], loop: Loop, inertia: np.ndarray | None
+) -> Plant:
+    """Return the robot of the first simulation: joint inertias J (its last n parameters), no bodies, no gravity."""
+    if inertia is None:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inertia = loop.controller.kd**2 / (2.0 * loop.controller.kp)
+        if not np.all(np.isfinite(inertia)) or not np.all(inertia > 0.0):
+            raise UsageError("kd² / (2 kp) of these gains is no inertia above 0; give the inertia (n,) [kg m²]")
+    extra = tuple(replace(motor, name=f"regular {motor.name}") for motor in standard(["Ia"] * model.n))
+    values = np.concatenate([np.zeros(model.p + len(terms)), inertia])
+    return plant_of(model, values, (*terms, *extra))
+
+
+def simulated_runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
+    """Return the noise-free simulation of every recording's loop."""
+    result: Runs = []
+    for case, loop in cases:
+        robot = plant.carrying(case.carried)
+        controller = loop.controller
+        if loop.design is not None:
+            controller = controller.scaled(robot.inertia_diagonal(loop.reference.q[::200]) / loop.design)
+        run = robot.run(controller, loop.reference, Sensing(every=loop.every))
+        result.append(((case, loop), run))
+    return result
+
+
+def between(start: Plant, end: Plant, share: float) -> Plant:
+    """Return the plant whose parameters are a share of the way from one plant to another."""
+    return end.with_parameters(share * end.parameters + (1.0 - share) * start.parameters)
+
+
+def nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tuple[Plant, Runs]:
+    """Return the plant halfway from `start` to `end`, or nearer where that cannot be simulated, and its runs.
+
+    Raises:
+        CannotSimulate: where none near `start` can.
+    """
+    problem: CalibError | None = None
+    for halvings in range(1, MAX_RETREATS + 1):
+        candidate = between(start, end, 0.5**halvings)
+        try:
+            return candidate, simulated_runs(candidate, cases)
+        except CalibError as error:
+            problem = error
+    raise CannotSimulate(f"no robot on the way to the estimate can be simulated: {problem}", start)
+
+
+def distance_percent(runs: Runs) -> np.ndarray:
+    """Return the position difference of simulated and recorded robot (n,), relative to the travel [%]."""
+    n = runs[0][0][0].motion.n
+    away, size = np.zeros((2, n))
+    for (case, loop), run in runs:
+        motion = case.motion
+        simulated = low_passed(run.q, motion)[simulated_samples(case, run.t, loop)]
+        away += np.sum((motion.q - simulated) ** 2, axis=0)
+        deviation = motion.q - motion.q.mean(axis=0)
+        size += np.sum(deviation**2, axis=0)
+    return frozen(100.0 * np.sqrt(away / size))
+
+
+def error_ratio(runs: Runs) -> np.ndarray:
+    """Return the ratios (n,) of recorded to simulated tracking errors, by regression; NaN where noise hides them."""
+    measured_errors = []
+    expected_errors = []
+    for (case, loop), run in runs:
+        motion = case.motion
+        samples = simulated_samples(case, run.t, loop)
+        ticks = np.arange(len(run.t)) * loop.every
+        reference, *_ = loop.reference.at(ticks)
+        reference = low_passed(reference, motion)[samples]
+        position = low_passed(run.q, motion)[samples]
+        measured_errors.append(reference - motion.q)
+        expected_errors.append(reference - position)
+    measured = np.concatenate(measured_errors)
+    expected = np.concatenate(expected_errors)
+    size = np.maximum(np.sum(expected**2, axis=0), 1e-300)
+    slope = np.sum(measured * expected, axis=0) / size
+    residual = measured - slope * expected
+    inflations = np.array([inflation(joint) for joint in residual.T])
+    sigma = np.sqrt(inflations * np.mean(residual**2, axis=0) / size)
+    clear = 5.0 * sigma < np.abs(slope) * np.log(MAX_GAIN_RATIO)
+    return frozen(np.where(clear, slope, np.nan))
