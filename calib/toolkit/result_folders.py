@@ -18,7 +18,7 @@ from calib.procedure.kinematic_stage.tables import read_covariance
 from calib.procedure.robot_kinds import joints_of, stage_of
 from calib.results.registry import drawn, open_result
 from calib.results.result import Result, StoredResult
-from calib.results.scene import ChartedResult as DrawnRobot
+from calib.results.scene import Drawn as DrawnRobot
 from calib.results.scene import ErrorSizes, Measured, Played, Scene, Torques, skeleton, strips, thinned
 
 __all__ = [
