@@ -14,7 +14,7 @@ from dataclasses import fields, is_dataclass
 from functools import cache
 from inspect import cleandoc
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
 from calib.config_types import UNKNOWN, Hidden, OneOf, ParsedTable, shown
 from calib.errors import CalibError, UsageError, suggestion
@@ -205,7 +205,7 @@ def inherited(table: Mapping[str, Any], kind: type) -> ParsedTable:
         return dict(table)
     common = {key: table[key] for key in _keys(kind) if key in table}
 
-    def filled(file_table: object) -> Any:
+    def filled(file_table: object) -> object:
         if not isinstance(file_table, Mapping):
             return file_table
         result = {**common, **file_table}
@@ -234,7 +234,7 @@ def described(source: object) -> dict[str, str]:
         descriptions |= _entries(base.__doc__ or "")
     for name, text in descriptions.items():
         if OTHERS in text:
-            descriptions[name] = text.replace(OTHERS, ", ".join(_others(source, name)))
+            descriptions[name] = text.replace(OTHERS, ", ".join(_others(cast(type, source), name)))
     return descriptions
 
 
@@ -301,7 +301,7 @@ def located(loc: Sequence[int | str], table: object = None) -> str:
     return result
 
 
-def _content(table: Any, key: Any) -> Any:
+def _content(table: object, key: int | str) -> object:
     """Return the value under a key of a table or at an index of a list; None where there is none."""
     if isinstance(table, Mapping):
         return table.get(key)

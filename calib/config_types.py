@@ -439,6 +439,7 @@ Name = Annotated[str, Expect("a text"), Checked(_filled)]
 Names = Annotated[tuple[str, ...], Expect("a list of names")]
 Label = Annotated[str, Checked(_label, {"type": ["string", "number"]})]
 Positive = Annotated[float, Real(above=0)]
+Tolerance = Annotated[float, Real(above=0.0, quantity="length"), Typed(unit="mm")] | None
 Holdout = Annotated[float, Real(least=0.0, most=0.99, words="a share from 0 to 0.99")]
 Seed = Annotated[int, Whole(0, 2**63 - 1)]
 NotNegative = Annotated[float, Real(least=0)]

@@ -52,7 +52,9 @@ def optional(value: object) -> Any:
 class SavedResult(Protocol):
     """A result that can be written to a folder."""
 
-    def save(self, out: str | Path, /, *, plots: bool = True) -> Path: ...
+    def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
+        """Write the result's folder."""
+        ...
 
 
 @contextmanager

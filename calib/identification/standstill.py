@@ -301,7 +301,7 @@ def _travel_since_standstill(
     position = torque_rows.of_joints(case.motion.q)[index]
     result = np.full(part.target.shape, np.inf)
     for start, stop in segments(segment):
-        for row in range(result.shape[1]):
+        for row in range(part.standing.shape[1]):
             runs = _runs(part.standing[start:stop, row] > 0.0)
             starts = [start + first for first, _ in runs[1:]]
             for (_, end), following in zip(runs, [*starts, stop]):

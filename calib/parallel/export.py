@@ -64,11 +64,11 @@ from calib.procedure.kinematic_stage.folder import URDF
 from calib.results.registry import open_result
 from calib.robot.calibrated import ROBOT
 from calib.robot.chain import Chain, Element, Joint
+from calib.robot.formats.native import NativeModel
 from calib.robot.formats.simulators import mjcf_text, pinocchio_model, pose_attributes
 from calib.robot.formats.urdf_tree import transform_body, with_comment
 from calib.robot.formats.urdf_write import add_joint, centred, numbers_text, put, write_new, xml_text
 from calib.robot.kinematics import joint_frames
-from calib.robot.native import NativeModel
 from calib.transforms import invert
 
 PLATFORM, CLOSURES = "platform", "robot.yaml"

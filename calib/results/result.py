@@ -11,8 +11,9 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, NoReturn, Protocol, runtime_checkable
 
+from calib.config_types import ParsedTable
 from calib.data.csv_table import Table, read_table
 from calib.errors import CalibError, SessionError, UsageError
 from calib.folders import METRICS, write_staged
@@ -148,7 +149,7 @@ class StoredResult:
         """Refuse: there is no motion to play."""
         self.refuse("program")
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> ParsedTable:
         """Return the content of ``metrics.json``; empty without."""
         metrics = self.path / METRICS
         if not metrics.is_file():

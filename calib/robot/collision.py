@@ -24,10 +24,10 @@ from calib.records import shaped
 from calib.robot.capsules import MIN_LENGTH, SAMPLES, TARGET_RADIUS, Capsules, closing_speed, inseparable
 from calib.robot.chain import Chain, random_joints
 from calib.robot.formats import urdf
+from calib.robot.formats.native import NativeModel, NativeShape
 from calib.robot.formats.simulators import configurations, driven_joints, link_frame
 from calib.robot.formats.urdf_tree import Node, is_urdf, numbers, origin, parse, text
 from calib.robot.kinematics import sweep
-from calib.robot.native import NativeModel, NativeShape
 from calib.robot.obstacles import Obstacle, Wall
 from calib.transforms import pose
 

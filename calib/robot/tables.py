@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import rtoml
@@ -16,6 +16,7 @@ import rtoml
 from calib import config, config_types
 from calib.config_types import Angle, Checked, Length, Name, Real, Text, shown
 from calib.errors import RobotError, refuse_robot
+from calib.records import FieldValues
 from calib.robot.chain import Chain
 from calib.transforms import from_xyz_rpy, to_xyz_rpy
 
@@ -33,13 +34,13 @@ Vector = tuple[Plain, Plain, Plain]
 Inertia = tuple[Plain, Plain, Plain, Plain, Plain, Plain, Plain, Plain, Plain, Plain]
 
 
-def _placement_table(value: Any) -> Any:
+def _placement_table(value: object) -> object:
     if not isinstance(value, Mapping):
         raise ValueError(f"expected xyz and rpy, or matrix; found {shown(value)}")
     return value
 
 
-def _foreign(value: Any) -> Any:
+def _foreign(value: object) -> object:
     return value
 
 
@@ -75,7 +76,7 @@ class PlacementTable:
 
 Placement = Annotated[PlacementTable, Checked(_placement_table)]
 # Table, or list of tables, that another reader takes.
-Foreign = Annotated[Any, Checked(_foreign, {"type": ["object", "array"]})]
+Foreign = Annotated[object, Checked(_foreign, {"type": ["object", "array"]})]
 
 
 @config.strict
@@ -108,9 +109,9 @@ class RobotTable:
     truth: Foreign = None
     provenance: Foreign = None
 
-    def chain_fields(self, where: str) -> dict[str, Any]:
+    def chain_fields(self, where: str) -> FieldValues:
         """Return the fields of a `Chain` that these keys give; `where` names the file in complaints."""
-        result: dict[str, Any] = {"name": self.name, "floor": self.floor}
+        result: FieldValues = {"name": self.name, "floor": self.floor}
         if self.base is not None:
             result["base"] = self.base
         if self.tip is not None:

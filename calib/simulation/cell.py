@@ -14,7 +14,6 @@ import io
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,7 +24,7 @@ from calib.data.poses.pose_lists import read_poses
 from calib.data.recordings.recording import Recording
 from calib.data.schema import Joints
 from calib.geometry.installation import Installation, see
-from calib.records import shaped
+from calib.records import FieldValues, shaped
 from calib.robot.calibrated import evaluate
 from calib.robot.chain import Chain, joint_kinds
 from calib.robot.kinematics import gravity_torques
@@ -126,7 +125,7 @@ def measure(
         sigma, sigma_rotation = _stated(instrument, measured[:, :3, 3], frames=2)
     position = measured[:, :3, 3] + _gross_errors(instrument, len(q), rng)
     recorded = np.asarray(q) + rng.normal(0.0, instrument.encoder_sigma, np.shape(q))
-    common: dict[str, Any] = {
+    common: FieldValues = {
         "sigma": sigma,
         "station": cell.truth.station_names[0],
         "tool_names": cell.truth.tool_names,

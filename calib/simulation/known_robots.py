@@ -6,10 +6,10 @@ Motions for simulated robots: random Fourier series within limits, and moves wit
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
+from calib.config_types import ParsedTable
 from calib.dynamics import drives
 from calib.dynamics.bodies import bodies_of, standard_parameters
 from calib.dynamics.idim import IdentificationModel
@@ -150,7 +150,7 @@ SIDED = ("Ia", "Fvl", "Fcl", "offl", "Fvm", "Fcm", "offm")  # drive terms of a j
 
 
 @cache
-def truth(name: str) -> dict[str, Any]:
+def truth(name: str) -> ParsedTable:
     """Return the true parameters of ``tx40``, ``rv2sq`` or ``lwr4plus``."""
     return description.read_extra(library.path(f"{name}_truth"))["truth"]
 

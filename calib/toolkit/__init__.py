@@ -1,5 +1,11 @@
 """The toolkit's parts for applications, by subject: what `import calib` offers beyond its verbs.
 
 An application imports from here instead of from inner modules, so that those can change. A module is loaded when an
-application asks for it: commands import inside their functions, and `calib --help` loads none.
+application asks for it: commands import inside their functions, and `calib --help` loads none. What commands need to
+declare their options is here itself.
 """
+
+from calib.procedure.answers import CertificateSection
+from calib.procedure.kinematic_stage.settings import Tolerance
+
+__all__ = ["CertificateSection", "Tolerance"]

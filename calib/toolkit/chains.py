@@ -2,7 +2,7 @@
 
 from calib.controllers.table import Controller, check_controller, controller_named, controller_of, controllers
 from calib.robot.calibrated import ROBOT as ROBOT_FILE
-from calib.robot.calibrated import CalibratedChain, Deflection, evaluate, nominal_of
+from calib.robot.calibrated import CalibratedChain, Deflection, Term, evaluate, nominal_of
 from calib.robot.calibrated import read as read_calibrated
 from calib.robot.calibrated import write as write_calibrated
 from calib.robot.chain import AXES, Chain, Element, Joint, joint_kinds, random_joints
@@ -25,6 +25,7 @@ __all__ = [
     "Deflection",
     "Element",
     "Joint",
+    "Term",
     "UrdfTree",
     "check_controller",
     "controller_named",

@@ -1,19 +1,19 @@
 """Results: their folders, figures and verdicts, and how they are shown."""
 
 from calib.api.dynamic import DynamicsModel
-from calib.api.kinematic import GeometryFit
-from calib.api.rendering import ChartedResult, Judged, Unjudged, saved
+from calib.api.kinematic import GeometryFit, Several, fit_geometry
+from calib.api.rendering import ChartedResult, Judged, Progress, Shown, Unjudged, saved
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.metrics import UnseenReport
 from calib.procedure.export.delivery import prediction
 from calib.procedure.export.geometry import read as read_exported
 from calib.procedure.export.geometry import results as geometry_results
-from calib.procedure.findings import LEVELS, Verdict, limit, lines_of, notes_of, sentence, settle
+from calib.procedure.findings import LEVELS, Note, Verdict, as_notes, limit, lines_of, notes_of, sentence, settle
 from calib.procedure.kinematic_stage.folder import IN_SESSION, URDF, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.procedure.kinematic_stage.inputs import read_file as read_measured_file
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics, ValidationMetrics
-from calib.procedure.kinematic_stage.settings import FitSettings, Tolerance
+from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.kinematic_stage.tables import read_covariance
 from calib.procedure.robot_kinds import joints_of, stage_of
 from calib.results.registry import drawn, open_result
@@ -38,18 +38,23 @@ __all__ = [
     "IdentificationFolder",
     "Judged",
     "Measured",
+    "Note",
     "Played",
+    "Progress",
     "Result",
     "Scene",
+    "Several",
+    "Shown",
     "StoredResult",
-    "Tolerance",
     "Torques",
     "Unjudged",
     "UnseenReport",
     "ValidationFolder",
     "ValidationMetrics",
     "Verdict",
+    "as_notes",
     "drawn",
+    "fit_geometry",
     "geometry_results",
     "joints_of",
     "limit",

@@ -40,9 +40,9 @@ def board(
         dictionary: marker dictionary: 4x4_50 to 7x7_1000, apriltag_36h11
         paper: a4, a3, a2, a1 or a0; by default the smallest that fits
     """
-    from calib.data.images.board_print import make
+    from calib.toolkit.boards import print_board
 
-    for line in make(out, kind, columns, rows, square, marker, dictionary, paper, overwrite):
+    for line in print_board(out, kind, columns, rows, square, marker, dictionary, paper, overwrite):
         say(line)
 
 
@@ -72,16 +72,16 @@ def images(
 
     with progress() as show:
         if source.is_dir() and (source / "board.toml").exists():
-            from calib.data.images.image_folders import look
+            from calib.toolkit.boards import look_at_images
 
-            lines = look(source, show)
+            lines = look_at_images(source, show)
         elif not source.exists():
             raise UsageError(f"{source}: no such file or folder")
         elif board is None or out is None:
             raise UsageError(f"{source} has no board.toml; for a bag give --board and --out")
         else:
-            from calib.data.images.image_bags import from_bag
+            from calib.toolkit.boards import images_from_bag
 
-            lines = from_bag(source, board, out, image_topic, joint_topic, show)
+            lines = images_from_bag(source, board, out, image_topic, joint_topic, show)
     for line in lines:
         say(line)

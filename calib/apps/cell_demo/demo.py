@@ -12,23 +12,55 @@ import numpy as np
 
 from calib import files
 from calib.apps.cell_demo.summary import Telling, row
-from calib.data.poses import IMAGES
 from calib.errors import SessionError, UsageError, command_line
 from calib.folders import read_estimate
-from calib.geometry import installation
-from calib.identification.model_file import read_dynamics
-from calib.procedure.session import dynamics_steps, steps
-from calib.procedure.session.commands import asks, new_session
-from calib.procedure.session.dynamics_steps import next_round
-from calib.procedure.session.folder import MARK, ROUND, Say, Session, locked, open_session
 from calib.records import read_lines
-from calib.robot import calibrated, library
-from calib.robot.library import load
-from calib.simulation.camera_cell import CameraCell, limits_of, seen_by_camera, take_pictures
-from calib.simulation.cell import Cell, measure, planned_poses, wandering, write_log, write_measured
-from calib.simulation.truth import TRUTH, position_errors, share_within, torque_errors, true_base
-from calib.simulation.virtual_arm import REST, MovingArm, moving_arm, play, record, sensed
-from calib.simulation.virtual_cells import virtual_cell
+from calib.toolkit.chains import load, read_calibrated, robot_names
+from calib.toolkit.installations import read_installation
+from calib.toolkit.pose_data import IMAGES
+from calib.toolkit.sessions import (
+    DONE,
+    KEPT,
+    MARK,
+    ROUND,
+    WAITING,
+    Say,
+    Session,
+    StepState,
+    asks,
+    designed_motions,
+    locked,
+    new_session,
+    next_round,
+    open_session,
+    run_next,
+    step_states,
+)
+from calib.toolkit.simulations import (
+    REST,
+    TRUTH,
+    CameraCell,
+    Cell,
+    MovingArm,
+    limits_of,
+    measure,
+    moving_arm,
+    planned_poses,
+    play,
+    record,
+    seen_by_camera,
+    sensed,
+    share_within,
+    take_pictures,
+    true_base,
+    true_position_errors,
+    true_torque_errors,
+    virtual_cell,
+    wandering,
+    write_log,
+    write_measured,
+)
+from calib.toolkit.torque_models import read_dynamics
 
 # numbers of poses: of the fit, of the validation, and of those that are measured again
 FIT, VALIDATION, REPEATED = 40, 20, 3
@@ -96,7 +128,7 @@ def run(
     started = time.perf_counter()
     cell = virtual_cell(robot, seed)
     if dynamics and cell.nominal.inertias is None:
-        supported = ", ".join(name for name in library.names() if load(name).inertias is not None)
+        supported = ", ".join(name for name in robot_names() if load(name).inertias is not None)
         say(f"geometry only: masses are known of {supported}")
         dynamics = False
     motion: dict[str, Any] = {}
@@ -118,10 +150,10 @@ def run(
     teller = Telling(session, say, progress, verbose)
     teller.said(f"the cell: {cell.note}")
     with locked(session):
-        waiting = steps.run_next(session, say if guided else teller.said, teller.progress, "calib demo")
-        while waiting is not None and waiting.kind == steps.WAITING and not guided:
+        waiting = run_next(session, say if guided else teller.said, teller.progress, "calib demo")
+        while waiting is not None and waiting.kind == WAITING and not guided:
             _bring_for(session, waiting.step.name, teller.said, teller.progress)
-            waiting = steps.run_next(session, teller.said, teller.progress, "calib demo")
+            waiting = run_next(session, teller.said, teller.progress, "calib demo")
     if waiting is not None:
         if not guided:
             raise SessionError(f"the demonstration stopped at {waiting.step.name}: {waiting.words}")
@@ -140,7 +172,7 @@ def run(
     return DemoResult(session, verdict, seconds, (), before, after, memory)
 
 
-def _stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
+def _stopped(session: Session, waiting: StepState) -> tuple[str, ...]:
     """Return the engineer's instructions, and the command that simulates them."""
     folder = session.folder
     simulate, go_on = command_line("demo", "--bring", folder), command_line("next", folder)
@@ -149,9 +181,9 @@ def _stopped(session: Session, waiting: steps.State) -> tuple[str, ...]:
 
 def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
     """Return the tool errors [mm] of nominal and calibrated arm against the truth; say and write all errors."""
-    cell_fit = installation.read(session.fit.path)
-    urdf = calibrated.read(session.fit.path).chain
-    before, after, bare = position_errors(cell, cell_fit, urdf)
+    cell_fit = read_installation(session.fit.path)
+    urdf = read_calibrated(session.fit.path).chain
+    before, after, bare = true_position_errors(cell, cell_fit, urdf)
     truth: dict[str, object] = {"position_mm": {"nominal": before, "calibrated": after, "urdf_alone": bare}}
     notes = [cell.note, f"errors over {TRUTH} poses of the whole joint range, rms"]
     lines = [
@@ -161,9 +193,9 @@ def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, 
     if session.dynamic:
         arm = arm_of(session, cell)
         chain, dynamics = read_dynamics(session.identification.path)
-        torques = torque_errors(cell, arm, dynamics.model, dynamics.values, chain)
+        torques = true_torque_errors(cell, arm, dynamics.model, dynamics.values, chain)
         # friction in the middle of the motion that was fitted
-        motion = dynamics_steps.designed_motions(session)[TRAINING]
+        motion = designed_motions(session)[TRAINING]
         running = LOGS[0][2] + REST + motion.period * motion.repeat / 2.0
         true = true_base(dynamics.model, cell, arm, session.settings.seed, running)
         within, count = share_within(true, read_estimate(session.identification.path))
@@ -188,8 +220,8 @@ def simulate_next(folder: Path, say: Say) -> None:
     """
     session = open_session(folder)
     robot = session.settings.robot.given
-    if robot not in library.names():
-        raise UsageError(f"{folder} is about {robot}; the simulated cells are of {', '.join(library.names())}")
+    if robot not in robot_names():
+        raise UsageError(f"{folder} is about {robot}; the simulated cells are of {', '.join(robot_names())}")
     with locked(session, say):
         step = _step_to_simulate(session)
         if not step:
@@ -206,12 +238,12 @@ def _step_to_simulate(session: Session) -> str:
     Raises:
         UsageError: where a step waits for something else.
     """
-    for state in steps.states(session):
-        if state.kind == steps.WAITING:
+    for state in step_states(session):
+        if state.kind == WAITING:
             return state.step.name
-        if state.kind not in (steps.DONE, steps.KEPT):
+        if state.kind not in (DONE, KEPT):
             raise UsageError(f"{session.folder} waits for no files; next: {command_line('next', session.folder)}")
-    if next_round(session) in dynamics_steps.designed_motions(session):
+    if next_round(session) in designed_motions(session):
         return "record"
     return ""
 
@@ -276,7 +308,7 @@ def _mark(session: Session, note: str) -> None:
 def simulate_recordings(session: Session, arm: MovingArm, seed: int) -> None:
     """Simulate recordings of the designed motions."""
     _mark(session, arm.note)
-    motions = dynamics_steps.designed_motions(session)
+    motions = designed_motions(session)
     logs = list(LOGS)
     for name in motions:
         if name.startswith(ROUND):

@@ -6,15 +6,22 @@ import numpy as np
 
 from calib import files
 from calib.apps.cell_demo.summary import PICTURE
-from calib.procedure.export.delivery import prediction
-from calib.procedure.report import fit_report
-from calib.procedure.report.charts import Chart, Panel, line, picture, text
-from calib.procedure.report.geometry_figures import error_histogram
-from calib.procedure.report.style import AFTER, BEFORE, BROWN, INK, QUIET
-from calib.procedure.session.folder import Session
-from calib.procedure.session.geometry_steps import chain_of
-from calib.procedure.session.results import position_errors, torque_error
-from calib.toolkit.result_folders import drawn, skeleton
+from calib.toolkit.report_charts import (
+    AFTER,
+    BEFORE,
+    BROWN,
+    INK,
+    QUIET,
+    Chart,
+    Panel,
+    error_histogram,
+    line,
+    picture,
+    text,
+)
+from calib.toolkit.report_pages import read_fit_report
+from calib.toolkit.result_folders import drawn, prediction, skeleton
+from calib.toolkit.sessions import Session, chain_of, position_errors, torque_error
 
 # from where the cell is seen
 AZIMUTH, ELEVATION = np.deg2rad([-60.0, 20.0])
@@ -62,7 +69,7 @@ def _cell(session: Session) -> Panel:
 
 def _errors(session: Session) -> Panel:
     """Return the histogram of the errors of nominal robot and robot.urdf on unseen poses."""
-    sets = fit_report.read(session.validation.report).sets
+    sets = read_fit_report(session.validation.report).sets
     (unseen,) = (rows for rows in sets if rows.unseen)
     nominal = np.array(unseen.nominal["position"])
     urdf = np.array((unseen.urdf_alone or unseen.calibrated)["position"])

@@ -10,17 +10,11 @@ from math import nan
 from shutil import get_terminal_size
 
 from calib.apps.viewer import viewer
-from calib.data.csv_table import read_table
 from calib.errors import command_line
 from calib.folders import CERTIFICATE, read_estimate
-from calib.procedure.dynamic_stage.metrics import UnseenReport
-from calib.procedure.export.delivery import prediction
-from calib.procedure.kinematic_stage.folder import URDF
-from calib.procedure.kinematic_stage.metrics import ValidationMetrics
-from calib.procedure.session.folder import SETTINGS, WAYS, Say, Session
-from calib.procedure.session.geometry_steps import chain_of
-from calib.procedure.session.results import position_errors, torque_error
-from calib.procedure.session.steps import steps_of
+from calib.toolkit.pose_data import read_table
+from calib.toolkit.result_folders import URDF, UnseenReport, ValidationMetrics, prediction
+from calib.toolkit.sessions import SETTINGS, WAYS, Say, Session, chain_of, position_errors, steps_of, torque_error
 
 PICTURE = "demo.png"
 # processor time of each step, about, by which the share done is told [s]

@@ -5,7 +5,7 @@ from pathlib import Path
 import typer
 
 from calib.cli.shared import command, say
-from calib.procedure.answers import CertificateSection
+from calib.toolkit import CertificateSection
 
 app = typer.Typer()
 

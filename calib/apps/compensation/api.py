@@ -8,14 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.api.kinematic import GeometryFit
-from calib.api.rendering import Progress, Shown, saved
 from calib.apps.compensation import joint_commands
 from calib.arguments import checked
-from calib.data.poses.pose_lists import Targets, read_targets
 from calib.errors import CalibError
-from calib.procedure.robot_kinds import joints_of, stage_of
 from calib.records import as_subclass
+from calib.toolkit.pose_data import Targets, read_targets
+from calib.toolkit.result_folders import GeometryFit, Progress, Shown, joints_of, saved, stage_of
 
 
 class JointCommands(Shown, joint_commands.Commands):

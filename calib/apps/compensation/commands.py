@@ -1,11 +1,14 @@
 """Command for joint commands that reach nominal targets: compensate."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from calib.cli.shared import Out, Seed, command, numbers, progress, say
+
+if TYPE_CHECKING:
+    from calib.records import FieldValues
 
 app = typer.Typer()
 
@@ -66,7 +69,7 @@ def compensate(
     from calib.apps.controller_programs.frames import stated_frame
     from calib.apps.controller_programs.targets import is_program, read_program, text_of
     from calib.errors import UsageError
-    from calib.procedure.export.geometry import results
+    from calib.toolkit.result_folders import geometry_results
 
     position_mm, turn_mrad = numbers(tolerance, 2, "--tolerance")
     fitted = api.read_fitted(folder)
@@ -81,11 +84,11 @@ def compensate(
         )
         raise UsageError(f"{targets}: {message}")
     written = [(out, (suffix,))]
-    files.check_results(written, [targets, *results(fitted.folder)], overwrite)
+    files.check_results(written, [targets, *geometry_results(fitted.folder)], overwrite)
     start_q = None
     if start:
         start_q = numbers(start, fitted.nominal.chain.n, "--start")
-    options: dict[str, Any] = {
+    options: FieldValues = {
         "frame": frame,
         "dof": dof,
         "tolerance": (1e-3 * position_mm, 1e-3 * turn_mrad),

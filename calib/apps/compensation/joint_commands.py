@@ -24,20 +24,27 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.poses.measurements import PoseMeasurements
-from calib.data.poses.pose_lists import Targets
 from calib.errors import Finding, UsageError, finding
-from calib.geometry import installation, inverse
-from calib.geometry.error_model import Discrepancy, ErrorModel, outside
-from calib.geometry.installation import Installation, see
-from calib.geometry.inverse import Goal
-from calib.geometry.observation import layout, pose_sigmas
-from calib.procedure.findings import lines_of, sentence
-from calib.procedure.kinematic_stage.folder import VALIDATED, ValidationFolder
-from calib.procedure.kinematic_stage.tables import read_covariance
-from calib.robot.calibrated import Deflection
-from calib.robot.chain import Chain
-from calib.toolkit.result_folders import open_result
+from calib.toolkit.chains import Chain, Deflection
+from calib.toolkit.installations import (
+    DOF,
+    Discrepancy,
+    ErrorModel,
+    Goal,
+    Installation,
+    conditions,
+    differences,
+    held_back,
+    layout,
+    nearest,
+    outside,
+    pose_sigmas,
+    reach,
+    read_arms,
+    see,
+)
+from calib.toolkit.pose_data import PoseMeasurements, Targets
+from calib.toolkit.result_folders import VALIDATED, ValidationFolder, lines_of, open_result, read_covariance, sentence
 from calib.transforms import from_xyz_rpy, invert, pose, rotation_vector
 
 # Thresholds are our choice.
@@ -150,7 +157,7 @@ def read(folder: str | Path) -> Fitted:
     fit = result.fit
     if fit is None:
         result.refuse("compensate")
-    cell, nominal = installation.read_arms(fit.path)
+    cell, nominal = read_arms(fit.path)
     free, covariance = read_covariance(fit.path, cell)
 
     metrics = fit.metrics()
@@ -277,11 +284,11 @@ def computed(
     poses, nominal_q = _reference(nominal_goal, targets, start, seed)
     say("the calibrated robot")
     q = _followed(goal, poses, nominal_q)
-    residual = _sizes(inverse.differences(goal, q, poses))
+    residual = _sizes(differences(goal, q, poses))
     start_q = np.clip(nominal_q, chain.lower, chain.upper)
-    nominal_residual = _sizes(inverse.differences(goal, start_q, poses))
+    nominal_residual = _sizes(differences(goal, start_q, poses))
     reached = _within(residual, tolerance) & _inside(nominal_goal, nominal_q)
-    singular = inverse.conditions(goal, nominal_q) < SINGULAR
+    singular = conditions(goal, nominal_q) < SINGULAR
     extrapolated = np.zeros(q.shape, bool)
     if fitted.fitted_q is not None:
         extrapolated = np.atleast_2d(outside(q, fitted.fitted_q))
@@ -296,7 +303,7 @@ def computed(
         # the arm's own error, its base placed where it fits the measurements best
         placed_nominal, placed_cell = placements(fitted, "nominal", tool)
         nominal_poses = see(placed_nominal, start_q).poses()
-        arm_error = _sizes(inverse.differences(replace(goal, cell=placed_cell), start_q, nominal_poses))
+        arm_error = _sizes(differences(replace(goal, cell=placed_cell), start_q, nominal_poses))
     return Commands(
         targets=targets,
         fitted=fitted,
@@ -324,10 +331,10 @@ def _inside(goal: Goal, q: np.ndarray) -> np.ndarray:
 def _followed(goal: Goal, poses: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Return joint values (m, n) near `start` that reach the poses; near a singularity they stay close to `start`."""
     clipped = np.clip(start, goal.lower, goal.upper)
-    q = inverse.nearest(goal, poses, clipped, inverse.reach(goal, poses, start))
+    q = nearest(goal, poses, clipped, reach(goal, poses, start))
     largest_correction = np.abs(q - start).max(axis=1, initial=0.0)
     excessive = np.flatnonzero(largest_correction > MAX_CORRECTION)
-    q[excessive] = inverse.held_back(goal, poses[excessive], start[excessive], MAX_CORRECTION)
+    q[excessive] = held_back(goal, poses[excessive], start[excessive], MAX_CORRECTION)
     return q
 
 
@@ -339,7 +346,7 @@ def _dof(targets: Targets, chain: Chain, requested: int | None) -> tuple[int, Fi
     able = 3
     if chain.n >= 5:
         able = min(chain.n, 6)
-    if requested not in (None, *inverse.DOF):
+    if requested not in (None, *DOF):
         raise UsageError(f"dof {requested}: expected 6, 5 (free to turn about the tool's z), or 3")
     if requested is not None and requested > available:
         columns = "qx, qy, qz, qw"
@@ -359,9 +366,9 @@ def _reference(goal: Goal, targets: Targets, start: Sequence[float] | None, seed
         return see(goal.cell, targets.q).poses(), np.array(targets.q)
     poses = pose(targets.rotation, targets.position)
     if targets.q is not None:
-        reached = inverse.reach(goal, poses, targets.q)
+        reached = reach(goal, poses, targets.q)
         clipped = np.clip(targets.q, goal.lower, goal.upper)
-        return poses, inverse.nearest(goal, poses, clipped, reached)
+        return poses, nearest(goal, poses, clipped, reached)
     lower, upper = goal.cell.chain.sampling_limits()
     if start is None:
         middle = 0.5 * (lower + upper)
@@ -376,8 +383,8 @@ def _sought(goal: Goal, poses: np.ndarray, start: np.ndarray, starts: np.ndarray
     best = np.tile(start, (len(poses), 1))
     cost = np.full(len(poses), np.inf)
     for first in (start, *starts):
-        q = inverse.reach(goal, poses, np.tile(first, (len(poses), 1)))
-        residual = _sizes(inverse.differences(goal, q, poses))
+        q = reach(goal, poses, np.tile(first, (len(poses), 1)))
+        residual = _sizes(differences(goal, q, poses))
         travel = np.abs(q - start).max(axis=1)
         travel = np.where(_within(residual, TOLERANCE), travel, np.inf)
         better = travel < cost

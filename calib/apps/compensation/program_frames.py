@@ -15,8 +15,8 @@ from calib.apps.compensation.joint_commands import Fitted
 from calib.apps.controller_programs.frames import Description, base_frame, flange_frame, stated_frame
 from calib.apps.controller_programs.languages import LANGUAGES, ProgramFrames, frames_in
 from calib.apps.controller_programs.targets import Program
-from calib.controllers.table import Controller
 from calib.errors import UsageError, listing
+from calib.toolkit.chains import Controller
 from calib.transforms import invert, to_xyz_rpy
 
 # [m, or as a rotation matrix] a frame that is stated and read in the program may differ by this

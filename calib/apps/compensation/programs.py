@@ -28,10 +28,10 @@ from calib.apps.controller_programs.configurations import (
     postures,
 )
 from calib.apps.controller_programs.targets import Program, pose_values
-from calib.data.poses.pose_lists import Targets
 from calib.errors import UsageError, listing
-from calib.geometry.installation import see
-from calib.geometry.inverse import Goal
+from calib.records import FieldValues
+from calib.toolkit.installations import Goal, see
+from calib.toolkit.pose_data import Targets
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +178,7 @@ def _check_postures(fitted: Fitted, program: Program, groups: Sequence[Group], s
 
 
 def _compensated_group(
-    fitted: Fitted, program: Program, group: Group, start: Sequence[float] | None, options: dict[str, Any]
+    fitted: Fitted, program: Program, group: Group, start: Sequence[float] | None, options: FieldValues
 ) -> Part:
     """Return the commands of poses with one tool and configuration."""
     controller = program.controller

@@ -38,8 +38,8 @@ def program(
     from calib.apps.controller_programs.motion import motion_file
     from calib.apps.controller_programs.program import program_files
     from calib.apps.controller_programs.targets import is_program, read_program
-    from calib.controllers.table import controllers
     from calib.errors import UsageError
+    from calib.toolkit.chains import controllers
 
     if listed:
         for name, row in controllers().items():
@@ -92,13 +92,13 @@ def deliver(
     from calib import files
     from calib.apps.controller_programs.delivery import delivery_text
     from calib.apps.controller_programs.frames import stated_frame
-    from calib.controllers.table import controller_named
-    from calib.procedure.export.geometry import results
+    from calib.toolkit.chains import controller_named
+    from calib.toolkit.result_folders import geometry_results
 
     statements = stated_frame(world, "--world"), stated_frame(flange, "--flange")
     text = delivery_text(folder, controller_named(controller), *statements)
     if out is None:
         say(text, result=True)
         return
-    with files.results([(out, (".txt",))], results(folder), overwrite):
+    with files.results([(out, (".txt",))], geometry_results(folder), overwrite):
         say(f"written to {files.write(out, text)}")

@@ -23,11 +23,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from calib.controllers.table import Controller
-from calib.geometry import inverse
-from calib.geometry.inverse import Goal
-from calib.robot.chain import AXES, Chain
-from calib.robot.kinematics import joint_frames
+from calib.toolkit.chains import AXES, Chain, Controller, joint_frames
+from calib.toolkit.installations import Goal, differences, reach
 
 # [m], [m²] the upright posture is clearly before axis 1, and its elbow clearly bent
 CLEAR = (0.01, 0.001)
@@ -300,7 +297,7 @@ def postures(
             starts = np.vstack([middle, starts, drawn[:STRAY]])
         goals = np.repeat(poses[waiting], len(starts), axis=0)
         all_starts = np.tile(starts, (len(waiting), 1))
-        q = inverse.reach(goal, goals, all_starts)
+        q = reach(goal, goals, all_starts)
         met = _met(goal, q, goals).reshape(len(waiting), -1)
         q = q.reshape(len(waiting), len(starts), -1)
         without = []
@@ -377,7 +374,7 @@ def _sign_text(signs: np.ndarray) -> str:
 
 def _met(goal: Goal, q: np.ndarray, poses: np.ndarray) -> np.ndarray:
     """Return which postures (m, n) reach their poses (m,)."""
-    difference = inverse.differences(goal, q, poses)
+    difference = differences(goal, q, poses)
     position_error = np.linalg.norm(difference[:, :3], axis=1)
     turn_error = np.linalg.norm(difference[:, 3:], axis=1)
     return (position_error <= MAX_POSITION_ERROR) & (turn_error <= MAX_TURN_ERROR)

@@ -15,11 +15,9 @@ import numpy as np
 
 from calib.apps.controller_programs.frames import ControllerFrame, Description, base_frame, flange_frame
 from calib.apps.controller_programs.targets import number, pose_values
-from calib.controllers.table import Controller
-from calib.geometry.installation import Installation, read_arms
-from calib.procedure.export.geometry import read
-from calib.robot.calibrated import CalibratedChain, nominal_of
-from calib.toolkit.result_folders import open_result
+from calib.toolkit.chains import CalibratedChain, Controller, nominal_of
+from calib.toolkit.installations import Installation, read_arms
+from calib.toolkit.result_folders import open_result, read_exported
 from calib.transforms import invert
 
 # of frames, by the unit of lengths
@@ -44,7 +42,7 @@ def delivery_text(
     result.check_arm("deliver")
     fit_folder = result.fit
     fit = folder if fit_folder is None else fit_folder.path
-    robot = read(fit, "deliver")
+    robot = read_exported(fit, "deliver")
     cell, nominal = read_arms(fit)
     arm = Description.of_fit(fit, nominal.chain)
     frames = base_frame(controller, arm, world), flange_frame(controller, arm, flange)

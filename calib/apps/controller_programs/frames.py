@@ -18,13 +18,9 @@ from typing import Self
 
 import numpy as np
 
-from calib.controllers.table import Controller
 from calib.errors import UsageError
-from calib.procedure.kinematic_stage.folder import FitFolder
-from calib.robot.chain import AXES, Chain
-from calib.robot.formats.urdf_tree import UrdfTree, text
-from calib.robot.formats.urdf_tree import read as read_tree
-from calib.robot.kinematics import forward, joint_frames
+from calib.toolkit.chains import AXES, Chain, Controller, UrdfTree, description_text, forward, joint_frames, read_tree
+from calib.toolkit.result_folders import FitFolder
 from calib.transforms import from_xyz_rpy, invert, rotation_vector, to_xyz_rpy
 from calib.units import plain_number
 
@@ -71,7 +67,7 @@ class Description:
         path = FitFolder(folder).urdf
         if not path.is_file():
             return cls(chain)
-        xml, *_ = text(path)
+        xml, *_ = description_text(path)
         return cls(chain, read_tree(xml, str(path)))
 
     @property

@@ -20,8 +20,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from calib.apps.controller_programs.targets import NUMBER, Program, Target, pose_of_values
-from calib.controllers.table import Controller
 from calib.errors import UsageError
+from calib.toolkit.chains import Controller
 
 # letters before a FANUC's pose in which its UF, UT and CONFIG stand
 BLOCK = 400

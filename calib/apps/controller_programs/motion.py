@@ -6,14 +6,13 @@ program sends. For ROS these commands write a JointTrajectory themselves. The mo
 """
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from calib.apps.controller_programs.targets import formatted
-from calib.controllers.table import Controller
-from calib.data.csv_table import read_header, read_table
 from calib.errors import UsageError
+from calib.toolkit.chains import Controller
+from calib.toolkit.pose_data import read_header, read_table
 from calib.toolkit.result_folders import open_result
 
 PREFIX = "q_"
@@ -61,7 +60,7 @@ def setpoints(path: Path, controller: Controller) -> tuple[np.ndarray, list[str]
     return CubicSpline(t, q)(times), [name.removeprefix(PREFIX) for name in columns]
 
 
-def stream_values(controller: Controller, q: np.ndarray) -> dict[str, Any]:
+def stream_values(controller: Controller, q: np.ndarray) -> dict[str, object]:
     """Return what the templates of streams print of setpoints (k, n) [rad]."""
     controller_values = controller.shown(q)
     rows = formatted(controller_values, controller.decimals)

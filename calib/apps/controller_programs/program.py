@@ -22,12 +22,10 @@ from calib import files
 from calib.apps.controller_programs.motion import is_motion, setpoints, stream_values
 from calib.apps.controller_programs.program_settings import CSV, ProgramSettings
 from calib.apps.controller_programs.targets import formatted, is_program, read_program
-from calib.controllers.table import Controller, check_controller, controller_named
-from calib.data.csv_table import Table, read_table
-from calib.data.poses.columns import OURS
-from calib.data.poses.pose_lists import read_poses
 from calib.errors import UsageError
-from calib.procedure.report.templates import read
+from calib.toolkit.chains import Controller, check_controller, controller_named
+from calib.toolkit.pose_data import OURS, Table, read_poses, read_table
+from calib.toolkit.report_pages import read_template
 from calib.units import ANGLES, LENGTHS
 
 
@@ -120,9 +118,10 @@ def program_files(
     check_controller(name, q.shape[1], settings.pulses)
     if settings.output is not None and not controller.outputs:
         raise UsageError(f"--output: {controller.title} raises no output; the operator presses a key")
+    values: dict[str, object]
     if moving:
         templates = controller.stream
-        values = stream_values(controller, q)
+        values = {**stream_values(controller, q)}
     else:
         templates = controller.files
         values = {"poses": _poses(controller, q, settings)}
@@ -209,4 +208,4 @@ def _template(file: str) -> jinja2.Template:
     environment = jinja2.Environment(
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, undefined=jinja2.StrictUndefined
     )
-    return environment.from_string(read("calib.apps.controller_programs", f"templates/{file}"))
+    return environment.from_string(read_template("calib.apps.controller_programs", f"templates/{file}"))

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.controllers.table import Controller, controller_of
 from calib.errors import MeasurementError, UsageError, listing
+from calib.toolkit.chains import Controller, controller_of
 from calib.transforms import pose as pose_of
 from calib.units import ANGLES
 

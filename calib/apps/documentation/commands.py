@@ -11,7 +11,8 @@ from calib.errors import UsageError, require
 
 app = typer.Typer()
 
-CLONE = Path(__file__).parents[3]  # where the package is used from a clone
+# where the package is used from a clone
+CLONE = Path(__file__).parents[3]
 PAGE = Path("docs/_build/html/index.html")
 ADVICE = "in a clone of the project: pip install '.[docs]' && python docs/build.py"
 
@@ -24,8 +25,9 @@ def docs() -> None:
 
     Example: calib docs
     """
-    found = [place / PAGE for place in (Path.cwd(), CLONE) if (place / PAGE).is_file()]
-    require(bool(found), f"the documentation has not been built here; {ADVICE}", UsageError)
+    pages = [folder / PAGE for folder in (Path.cwd(), CLONE)]
+    built = [page for page in pages if page.is_file()]
+    require(bool(built), f"the documentation has not been built here; {ADVICE}", UsageError)
     if sys.stdout.isatty():
-        webbrowser.open(found[0].as_uri())
-    say(str(found[0]))
+        webbrowser.open(built[0].as_uri())
+    say(str(built[0]))

@@ -5,7 +5,6 @@ import socket
 import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from typing import Any
 
 from calib.errors import TaskLost
 from calib.workers import Workers
@@ -17,7 +16,7 @@ class Throughput:
     def __init__(self) -> None:
         self.began, self.spent = time.monotonic(), dict[str, list[float]]()
 
-    def completed(self, crew: Workers, function: Callable[[Any], Any], tasks: Iterable[Any]) -> Iterator[tuple]:
+    def completed(self, crew: Workers, function: Callable[..., object], tasks: Iterable[object]) -> Iterator[tuple]:
         """Yield (number of the task, its result) as `Workers.completed` does, noting who ran it."""
         for number, answer in crew.completed(partial(_signed, function), tasks):
             if isinstance(answer, TaskLost):
@@ -45,7 +44,7 @@ class Throughput:
         return lines
 
 
-def _signed(function: Callable[[Any], Any], task: Any) -> tuple[Any, str, float]:
+def _signed(function: Callable[..., object], task: object) -> tuple[object, str, float]:
     """Run a task; return its result, who ran it, and the seconds of wall time."""
     started = time.monotonic()
     result = function(task)

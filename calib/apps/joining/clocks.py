@@ -20,21 +20,24 @@ from scipy.signal import correlate, correlation_lags
 from calib.apps.joining.clock_steps import BACKLASH, Equations
 from calib.apps.joining.order import MAX_MISFIT
 from calib.apps.joining.stream_files import Stream
-from calib.data.poses.measurements import Positions, take
 from calib.errors import refuse_data
-from calib.estimation import robust
-from calib.estimation.relevance import gram, relevance
-from calib.geometry.first_guess import install
-from calib.geometry.fit import plausible_deviation
-from calib.geometry.installation import Installation
-from calib.geometry.model_choice.cross_validation import term_sizes
-from calib.geometry.model_choice.ladder import EFFECTS
-from calib.geometry.observability import base_columns
-from calib.geometry.observation import layout, observe, parameter_values, prepare, step
 from calib.records import evenly
-from calib.robot.calibrated import Deflection, Term
-from calib.robot.chain import Chain
-from calib.robot.kinematics import forward
+from calib.toolkit.chains import Chain, Deflection, Term, forward
+from calib.toolkit.installations import (
+    EFFECTS,
+    Installation,
+    base_columns,
+    install,
+    layout,
+    observe,
+    parameter_values,
+    plausible_deviation,
+    prepare,
+    step,
+    term_sizes,
+)
+from calib.toolkit.pose_data import Positions, take
+from calib.toolkit.statistics import gram, relevance, robust_weights, spread
 from calib.transforms import invert, rotation_vector
 
 # of the offsets that are tried first [s]
@@ -163,12 +166,12 @@ def begin(chain: Chain, run: Run) -> tuple[Installation, Clock, tuple[float, ...
         starts.append(_Start(float(np.sqrt(np.mean(smallest**2))), clock, cell))
 
     best_misfit = min((start.misfit for start in starts), default=np.inf)
-    spread = float(np.linalg.norm(run.points.position.std(axis=0)))
-    if best_misfit > min(MAX_RATIO * spread, MAX_MISFIT * chain.stretched_length()):
+    extent = float(np.linalg.norm(run.points.position.std(axis=0)))
+    if best_misfit > min(MAX_RATIO * extent, MAX_MISFIT * chain.stretched_length()):
         refuse_data(
             run.stream.file,
             f"at no offset of the clocks its points are on the path of the nominal arm by {run.log.file} (the best "
-            f"leaves {1e3 * best_misfit:.3g} mm of a motion of {1e3 * spread:.3g} mm): is it the log of this "
+            f"leaves {1e3 * best_misfit:.3g} mm of a motion of {1e3 * extent:.3g} mm): is it the log of this "
             "motion, and of this robot, did instrument and target stay in place, and did no clock jump? "
             f"({'; '.join(run.lines())})",
         )
@@ -296,8 +299,8 @@ def fitted(
 
     loss = "none" if backlash else "huber"
     middle_time = run.stream.t[rows] - clock.middle
-    spread = np.full(len(guess), np.inf)
-    for _ in range(ROUNDS):
+    rounds = 0
+    while True:
         # the prior's mean minus the present values
         pulled = np.zeros(len(guess))
         pulled[: len(free)] = (parameter_values(start) - parameter_values(cell))[free]
@@ -312,9 +315,9 @@ def fitted(
         targets, slopes = list[np.ndarray](), list[np.ndarray]()
         backlash_slopes, offset_slopes = list[np.ndarray](), list[np.ndarray]()
         for part, joint_part, speed in zip(parts, joint_parts, speeds):
-            sigma = max(robust.spread(part.value), 1e-9)
+            sigma = max(spread(part.value), 1e-9)
             size = np.sqrt(np.mean(part.value**2, axis=0))
-            weight = np.sqrt(robust.weights(size / sigma, loss)) / sigma
+            weight = np.sqrt(robust_weights(size / sigma, loss)) / sigma
             targets.append((weight * part.value).ravel())
             offset_slopes.append((weight * -speed).ravel())
             backlash_slope = weight * side * joint_part.jacobian
@@ -336,14 +339,15 @@ def fitted(
         change = inverse @ (matrix.T @ target)
         squares = float(np.sum((target - matrix @ change) ** 2))
         variance = squares / max(len(target) - len(guess), 1)
-        spread = np.sqrt(variance * np.diag(inverse)) / scale
+        column_sigma = np.sqrt(variance * np.diag(inverse)) / scale
         change /= scale
         cell = step(cell, free, change[: len(free)])
         clock = replace(clock, offset=clock.offset + change[-2], drift=clock.drift + change[-1])
-        if abs(change[-2]) < SETTLED:
+        rounds += 1
+        if abs(change[-2]) < SETTLED or rounds == ROUNDS:
             break
 
-    clock = replace(clock, sigma=float(spread[-2]), drift_sigma=float(spread[-1]))
+    clock = replace(clock, sigma=float(column_sigma[-2]), drift_sigma=float(column_sigma[-1]))
     offset_slope = np.concatenate(offset_slopes)
     times = np.tile(run.stream.t[rows], len(offset_slope) // len(rows))
     equations = Equations(matrix, target, offset_slope, np.concatenate(backlash_slopes), times)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import files
-from calib.data.csv_table import Table
+from calib.toolkit.pose_data import Table
 
 NAMES = ("name", "point", "pointname", "pointid", "pose", "poseid", "id", "label", "target", "number", "no", "nr")
 CLOCKS = ("t", "time", "timestamp", "datetime")

@@ -40,15 +40,11 @@ from calib.apps.joining.joined import CLOCKS, NAMES, Joined, column_of
 from calib.apps.joining.order import MAX_MISFIT, MIN_FOUND, MIN_POINTS, find_order
 from calib.apps.joining.streams import join_streams
 from calib.arguments import checked
-from calib.data.csv_table import Table, read_table
-from calib.data.poses.columns import POSITION, SIGMA, Sheet
-from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import MeasurementError, UsageError, counted, finding, listing, one_of, refuse_data
-from calib.geometry.first_guess import check_scale
-from calib.procedure.findings import lines_of
-from calib.robot.calibrated import CalibratedChain
-from calib.robot.chain import Chain
-from calib.robot.library import load_calibrated
+from calib.toolkit.chains import CalibratedChain, Chain, load_calibrated
+from calib.toolkit.installations import check_scale
+from calib.toolkit.pose_data import POSITION, SIGMA, PoseMeasurements, Sheet, Table, read_table
+from calib.toolkit.result_folders import lines_of
 from calib.units import TIMES
 
 METHODS = ("name", "time", "row", "geometry", "motion")

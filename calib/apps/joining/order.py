@@ -18,11 +18,10 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment, minimize
 from scipy.spatial.distance import cdist, pdist, squareform
 
-from calib.data.poses.measurements import PoseMeasurements
 from calib.errors import CalibError
-from calib.geometry.first_guess import install
-from calib.robot.chain import Chain
-from calib.robot.kinematics import forward
+from calib.toolkit.chains import Chain, forward
+from calib.toolkit.installations import install
+from calib.toolkit.pose_data import PoseMeasurements
 
 # Thresholds are our choice.
 # of the arm's length: what nominal errors leave in the right order, at most
@@ -121,7 +120,8 @@ def _refined(
     chain: Chain, q: np.ndarray, points: np.ndarray, pose: np.ndarray, limit: float, prefer: np.ndarray | None = None
 ) -> Order | None:
     """Return the order that a first order leads to, None if most of the points then belong to no pose."""
-    for _ in range(MAX_ROUNDS):
+    rounds = 0
+    while True:
         assigned = np.flatnonzero(pose >= 0)
         if len(assigned) < MIN_POINTS:
             return None
@@ -133,7 +133,8 @@ def _refined(
         bound = max(limit, 3.0 * float(np.median(cost[assigned, pose[assigned]])))
         before = pose
         pose = _assigned(cost, bound, prefer)
-        if np.array_equal(before, pose):
+        rounds += 1
+        if np.array_equal(before, pose) or rounds == MAX_ROUNDS:
             break
     # several readings of one pose
     repeated = (pose < 0) & (cost.min(axis=1) < limit)

@@ -10,18 +10,21 @@ import numpy as np
 
 from calib.apps.joining.joined import NAMES, column_of
 from calib.apps.joining.joining import MIN_POINTS, merged, ordered
-from calib.data.csv_table import Table, read_table
-from calib.data.poses.columns import POSITION, Sheet
-from calib.data.poses.fit_options import FileOptions
-from calib.data.poses.measurements import PoseMeasurements, Positions
-from calib.data.poses.pose_files import read_measurements
-from calib.data.poses.pose_lists import read_poses
-from calib.data.poses.robodk import recognises
 from calib.errors import finding
-from calib.procedure.findings import lines_of
-from calib.procedure.robot_kinds import joints_of
-from calib.robot.chain import Chain
-from calib.robot.kinematics import forward
+from calib.toolkit.chains import Chain, forward
+from calib.toolkit.pose_data import (
+    POSITION,
+    FileOptions,
+    PoseMeasurements,
+    Positions,
+    Sheet,
+    Table,
+    is_robodk_file,
+    read_measurements,
+    read_poses,
+    read_table,
+)
+from calib.toolkit.result_folders import joints_of, lines_of
 
 # between a commanded and a reached joint position [rad or m] (our choice)
 SIGMA_JOINT = 1e-4
@@ -45,7 +48,7 @@ def read_planned(path: Path, chain: Chain, options: FileOptions) -> list[PoseMea
     sheet = Sheet(points, options)
     position_columns = sheet.family(POSITION.names)
     joint_columns = {*chain.joint_names, *(f"q_{name}" for name in chain.joint_names), "q1", *options.columns}
-    if joint_columns & set(points.header) or recognises(points.header) or not position_columns:
+    if joint_columns & set(points.header) or is_robodk_file(points.header) or not position_columns:
         return []
     q = read_poses(options.planned, joints_of(chain))
     orders = _stated_orders(points, len(q))

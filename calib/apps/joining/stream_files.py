@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from calib.apps.joining.joined import CLOCKS, column_of
-from calib.data.csv_table import Table, opened, plain_rows, split_units
-from calib.data.signals.resampling import GAP
 from calib.errors import MeasurementError, counted, listing, refuse_data, refused_as
+from calib.toolkit.pose_data import Table, opened, plain_rows, split_units
+from calib.toolkit.recordings import GAP
 from calib.units import TIMES
 
 # Thresholds are our choice.

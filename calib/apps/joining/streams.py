@@ -20,19 +20,25 @@ from calib.apps.joining.clock_steps import Step, find_step
 from calib.apps.joining.clocks import Clock, Run, begin, fitted, residuals, velocities
 from calib.apps.joining.joined import Joined
 from calib.apps.joining.stream_files import Kind, Stream, read_stream
-from calib.data.csv_table import Table
-from calib.data.poses.columns import LATE, POSITION, QUATERNION, Sheet
-from calib.data.poses.measurements import PoseMeasurements
-from calib.data.poses.plausible import check_joints, outside, unit_quaternions
-from calib.data.schema import BOUNDS, max_travel
 from calib.errors import Finding, finding, refuse_data
-from calib.estimation import robust
-from calib.estimation.whiteness import autocorrelation, inflation
-from calib.geometry.installation import Installation
-from calib.procedure.findings import lines_of
-from calib.procedure.robot_kinds import joints_of
 from calib.records import evenly
-from calib.robot.chain import Chain, joint_kinds
+from calib.toolkit.chains import Chain, joint_kinds
+from calib.toolkit.installations import Installation
+from calib.toolkit.pose_data import (
+    BOUNDS,
+    LATE,
+    POSITION,
+    QUATERNION,
+    PoseMeasurements,
+    Sheet,
+    Table,
+    check_joints,
+    max_travel,
+    outside,
+    unit_quaternions,
+)
+from calib.toolkit.result_folders import joints_of, lines_of
+from calib.toolkit.statistics import autocorrelation, inflation, spread
 from calib.units import JOINT
 
 # time between the rows that are held, of instrument and log [s]
@@ -103,7 +109,7 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
         _refuse(step, wander, run, clock)
     usable, errors, velocity, findings = _usable(cell, run, clock)
     tau = max(inflation(row) for row in errors)
-    sigma = robust.spread(errors[:3])
+    sigma = spread(errors[:3])
     min_interval = stream.step * (1.0 + 1.5 * (tau - 1.0))
     chosen, spacing = _thinned(stream.t[usable], run.joints(clock, usable), min_interval)
     rows = usable[chosen]
@@ -209,7 +215,7 @@ def _usable(cell: Installation, run: Run, clock: Clock) -> tuple[np.ndarray, np.
     stream.dropped["outside the log or in its gaps"] = len(stream.t) - len(usable)
 
     errors = residuals(cell, run, usable, clock)
-    bounds = OUTLIER * np.array([[robust.spread(row)] for row in errors])
+    bounds = OUTLIER * np.array([[spread(row)] for row in errors])
     consistent = (np.abs(errors) < bounds).all(axis=0)
     stream.dropped["far from the arm's path"] = int((~consistent).sum())
     usable, errors = usable[consistent], errors[:, consistent]
@@ -271,11 +277,11 @@ def _target() -> Kind:
     def sound(values: np.ndarray) -> np.ndarray:
         position, turn = values[:, :3], values[:, 3:]
         within_bounds = (np.abs(position) <= BOUNDS.max_length).all(axis=1)
-        sound_rows = within_bounds & position.any(axis=1)
-        if not turn.size:
-            return sound_rows
-        norm_error = np.abs(np.linalg.norm(turn, axis=1) - 1.0)
-        return sound_rows & (norm_error <= BOUNDS.max_norm_error)
+        unit = np.ones(len(values), dtype=bool)
+        if turn.size:
+            norm_error = np.abs(np.linalg.norm(turn, axis=1) - 1.0)
+            unit = norm_error <= BOUNDS.max_norm_error
+        return np.asarray(within_bounds & position.any(axis=1) & unit)
 
     def refuse(table: Table, values: np.ndarray) -> None:
         POSITION.check(values[:, :3], table, names(table)[:3])

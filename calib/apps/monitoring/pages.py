@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from calib import files, folders
 from calib.toolkit.report_pages import Pictures, Section
@@ -23,7 +23,7 @@ class ResultPart(NamedTuple):
     section: Section
     charts: Mapping[str, Chart]
     captions: Sequence[str]
-    table: tuple[str, Sequence[str], Iterable[Sequence[Any]]]
+    table: tuple[str, Sequence[str], Iterable[Sequence[object]]]
 
 
 def save(
@@ -32,7 +32,7 @@ def save(
     title: str,
     setup: Mapping[str, str],
     parts: Sequence[ResultPart],
-    numbers: Any,
+    numbers: object,
     tables: Sequence[str],
 ) -> Path:
     """Write the folder `out` and return its path; `tables`: names of all that this `kind` of result may write.
@@ -45,7 +45,7 @@ def save(
     return folders.write_staged(out, file_names, lambda folder: _write(folder, title, setup, parts, numbers))
 
 
-def _write(folder: Path, title: str, setup: Mapping[str, str], parts: Sequence[ResultPart], numbers: Any) -> None:
+def _write(folder: Path, title: str, setup: Mapping[str, str], parts: Sequence[ResultPart], numbers: object) -> None:
     from calib.toolkit.report_charts import picture
     from calib.toolkit.report_pages import Entry, as_html, report_page
 

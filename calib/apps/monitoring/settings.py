@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 
 from calib.arguments import checked
-from calib.config_types import Flag, Positive, Seed, Text
-from calib.toolkit.result_folders import Tolerance
+from calib.config_types import Flag, Positive, Seed, Text, Tolerance
 
 
 @checked

@@ -13,15 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.api.kinematic import GeometryFit, Several, fit_geometry
-from calib.api.rendering import Progress
 from calib.apps.registration.settings import DEFAULT_PLACEMENT, PlacementSettings
-from calib.data.poses.fit_options import FitOptions
-from calib.estimation.estimate import Estimate
-from calib.geometry.installation import FRAME_AXES
-from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.records import as_subclass
-from calib.robot.calibrated import CalibratedChain
+from calib.toolkit.chains import CalibratedChain
+from calib.toolkit.installations import FRAME_AXES
+from calib.toolkit.pose_data import FitOptions
+from calib.toolkit.result_folders import FitSettings, GeometryFit, Progress, Several, fit_geometry
+from calib.toolkit.statistics import Estimate
 from calib.transforms import invert
 from calib.units import DEG
 
@@ -89,7 +87,7 @@ class Placements(GeometryFit):
             frames.append(Placed(f"{standing} '{name}' in {chain.base}", inverse, sigma))
         return tuple(frames)
 
-    def lines(self, *first: str) -> Iterator[Any]:
+    def lines(self, *first: str) -> Iterator[str]:
         """Yield what a command prints: the frames whose names begin with one of `first`, and the verdict."""
         poses = self.fit.poses
         yield str(self.verdict)
@@ -98,7 +96,7 @@ class Placements(GeometryFit):
                 yield str(frame)
         rms_mm = 1e3 * self.fit.errors[1].rms
         yield f"{poses} poses, {rms_mm:.3g} mm rms residual; σ follows from it, the arm's random errors included"
-        yield from self.warnings
+        yield from map(str, self.warnings)
         if poses < USUAL_POSES:
             yield f"{poses} poses are few: measure {USUAL_POSES}, with the wrist turned by 90° and more between them"
 

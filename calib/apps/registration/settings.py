@@ -3,8 +3,7 @@
 from dataclasses import dataclass
 
 from calib.arguments import checked
-from calib.config_types import Holdout
-from calib.procedure.kinematic_stage.settings import Tolerance
+from calib.config_types import Holdout, Tolerance
 
 
 @checked

@@ -39,18 +39,24 @@ def serve(folder: Path, host: str = LOCAL, port: Annotated[int, typer.Option(min
     from calib.apps.serve.work import Work
 
     open_session(folder)
-    token = "" if host in (LOCAL, "localhost") else secrets.token_urlsafe(16)
+    token = query = ""
+    if host not in (LOCAL, "localhost"):
+        token = secrets.token_urlsafe(16)
+        query = f"?token={token}"
     message = f"cannot listen on {host}, port {port} ({{}}); try another --port"
     with refused_as(UsageError, (OSError, OverflowError), message):
         listening = socket.create_server((host, port))
     work = Work(folder)
-    address_host = _own_address() if host == "0.0.0.0" else host
-    address = f"http://{address_host}:{listening.getsockname()[1]}/{f'?token={token}' if token else ''}"
+    reached_by = host
+    if host == "0.0.0.0":
+        reached_by = _own_address()
+    address = f"http://{reached_by}:{listening.getsockname()[1]}/{query}"
     say(f"{folder}: {address} (Ctrl-C stops)", result=True)
     try:
         config = uvicorn.Config(application(work, token, host), log_level="warning", server_header=False)
         uvicorn.Server(config).run(sockets=[listening])
-    except KeyboardInterrupt:  # uvicorn hands it on once it has stopped
+    except KeyboardInterrupt:
+        # uvicorn hands it on once it has stopped
         pass
     finally:
         work.stop()
@@ -62,7 +68,8 @@ def _own_address() -> str:
 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as route:
         try:
-            route.connect(("192.0.2.1", 9))  # an address of documentation (RFC 5737)
+            # an address of documentation (RFC 5737)
+            route.connect(("192.0.2.1", 9))
             return route.getsockname()[0]
         except OSError:
             return socket.gethostname()

@@ -37,36 +37,42 @@ from calib.toolkit.sessions import (
     steps_of,
 )
 
-HERE = "calib.apps.serve"
+TEMPLATES = "calib.apps.serve"
 DRIFT = "the first poses measured again at the end, to check for drift (optional)"
 PICTURES = (".png", ".svg")
 OURS = "default-src 'none'; style-src 'unsafe-inline'; script-src 'self'; connect-src 'self'; img-src 'self' data:"
 POLICY = f"{OURS}; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
-SANDBOX = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"  # of files, whoever wrote them
+# of files, whoever wrote them
+SANDBOX = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox"
 
 
 class Guard:
     """Refuses requests without the token, for another host's name (DNS rebinding), and posts of other sites' pages."""
 
     def __init__(self, app: ASGIApp, token: str, host: str) -> None:
-        self.app, self.token = app, token
+        self.app = app
+        self.token = token
         name = socket.gethostname()
-        self.names = {"localhost", host.lower(), name.lower(), f"{name}.local".lower(), socket.getfqdn().lower()}
+        names = ("localhost", host, name, f"{name}.local", socket.getfqdn())
+        self.names = {name.lower() for name in names}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        answer = self._answer(Request(scope)) if scope["type"] == "http" else None
-        await (answer or self.app)(scope, receive, send)
+        responder = self.app
+        if scope["type"] == "http":
+            responder = self._answer(Request(scope)) or self.app
+        await responder(scope, receive, send)
 
     def _answer(self, request: Request) -> Response | None:
         """Return what is said in place of a page; None for a request that may pass."""
-        requested_host, origin = request.headers.get("host", ""), request.headers.get("origin")
+        requested_host = request.headers.get("host", "")
         if not self._is_ours(requested_host):
             return PlainTextResponse("This page is not served under that name: use the address printed.", 403)
-        if request.method != "GET" and (
-            (origin is not None and urlsplit(origin).netloc != requested_host)
-            or request.headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none")
-        ):
-            return PlainTextResponse("Another site's page asked for this; nothing was changed.", 403)
+        if request.method != "GET":
+            origin = request.headers.get("origin")
+            other_origin = origin is not None and urlsplit(origin).netloc != requested_host
+            site = request.headers.get("sec-fetch-site", "same-origin")
+            if other_origin or site not in ("same-origin", "none"):
+                return PlainTextResponse("Another site's page asked for this; nothing was changed.", 403)
         cookie = f"calib-{urlsplit(f'//{requested_host}').port or 80}"
         if self.token and not self._knows(request.cookies.get(cookie, "")):
             if request.method != "GET" or not self._knows(request.query_params.get("token", "")):
@@ -83,8 +89,9 @@ class Guard:
         except ValueError:
             return False
         try:
+            # Nobody can rebind a number.
             ipaddress.ip_address(name)
-            return True  # nobody can rebind a number
+            return True
         except ValueError:
             return name in self.names
 
@@ -114,15 +121,20 @@ def application(work: Work, token: str = "", host: str = "127.0.0.1") -> Starlet
     guard = Middleware(Guard, token=token, host=host)  # type: ignore[arg-type]
     errors = {CalibError: refused, OSError: refused}
     app = Starlette(routes=routes, middleware=[guard], exception_handlers=errors)  # type: ignore[arg-type]
-    app.state.work, app.state.view = work, WebViewer()
+    app.state.work = work
+    app.state.view = WebViewer()
     atexit.register(app.state.view.close)
     return app
 
 
 def refused(request: Request, error: Exception) -> Response:
     """Return a page with an error's message."""
-    message = (complaint(error) or (str(error), 2))[0]
-    return HTMLResponse(filled(HERE, "refused.html", message=message), 400, {"Content-Security-Policy": POLICY})
+    message = str(error)
+    foreseen = complaint(error)
+    if foreseen:
+        message = foreseen[0]
+    html = filled(TEMPLATES, "refused.html", message=message)
+    return HTMLResponse(html, 400, {"Content-Security-Policy": POLICY})
 
 
 def page(request: Request) -> Response:
@@ -130,27 +142,42 @@ def page(request: Request) -> Response:
     work: Work = request.app.state.work
     session = open_session(work.folder)
     states = step_states(session)
-    ahead = next((state for state in states if state.kind not in (DONE, KEPT)), None)
-    waits = ahead if ahead is not None and ahead.kind == WAITING else None
-    task, file = asks(session, waits) if waits else ("", "")
-    pictures = [path for path in _files(session) if path.suffix in PICTURES]
+    ahead = None
+    for state in states:
+        if state.kind not in (DONE, KEPT):
+            ahead = state
+            break
+    task = to_bring = ""
+    if ahead is not None and ahead.kind == WAITING:
+        task, to_bring = asks(session, ahead)
+    verdicts = None
+    if ahead is None:
+        verdicts = session.verdicts()
+    recording = ""
+    if session.path(RECORDING).exists():
+        recording = RECORDING
+    paths = _files(session)
     values = {
         "session": session,
         "states": states,
         "ahead": ahead,
         "work": work,
-        "to_bring": file,
+        "to_bring": to_bring,
         "tasks": [re.sub(r"^\d+ ", "", line) for line in task.splitlines()],
-        "verdicts": None if ahead else session.verdicts(),
+        "verdicts": verdicts,
         "kinds": _kinds(session),
         "notes": _notes(session),
-        "pages": [name for name in PAGES if session.path(name).exists()],
-        "recording": RECORDING if session.path(RECORDING).exists() else "",
-        "pictures": [_name(session, path) for path in pictures],
-        "files": [_name(session, path) for path in _files(session)],
+        "pages": _pages(session),
+        "recording": recording,
+        "pictures": [_name(session, path) for path in paths if path.suffix in PICTURES],
+        "files": [_name(session, path) for path in paths],
     }
     headers = {"Content-Security-Policy": POLICY, "Cache-Control": "no-store"}
-    return HTMLResponse(filled(HERE, "page.html", **values), headers=headers)
+    return HTMLResponse(filled(TEMPLATES, "page.html", **values), headers=headers)
+
+
+def _pages(session: Session) -> list[str]:
+    return [name for name in PAGES if session.path(name).exists()]
 
 
 def _notes(session: Session) -> dict[str, tuple[str, ...]]:
@@ -176,8 +203,13 @@ def _name(session: Session, path: Path) -> str:
 
 def _files(session: Session) -> list[Path]:
     """Return the session's files, without hidden ones."""
-    paths = sorted(path for path in session.folder.rglob("*") if path.is_file())
-    return [path for path in paths if not any(part.startswith(".") for part in path.relative_to(session.folder).parts)]
+    visible = []
+    for path in sorted(session.folder.rglob("*")):
+        parts = path.relative_to(session.folder).parts
+        hidden = any(part.startswith(".") for part in parts)
+        if path.is_file() and not hidden:
+            visible.append(path)
+    return visible
 
 
 def script(request: Request) -> Response:
@@ -191,8 +223,11 @@ def file(request: Request) -> Response:
     path = session.folder / request.path_params["name"]
     if path not in _files(session) or not path.resolve().is_relative_to(session.folder.resolve()):
         return PlainTextResponse("no such file in this session", 404)
-    policy = {} if path.suffix == ".pdf" else {"Content-Security-Policy": SANDBOX}  # viewers of PDF are scripts
-    return FileResponse(path, headers={**policy, "X-Content-Type-Options": "nosniff", "Cache-Control": "no-cache"})
+    headers = {"X-Content-Type-Options": "nosniff", "Cache-Control": "no-cache"}
+    # Viewers of PDF are scripts, which a sandbox would stop.
+    if path.suffix != ".pdf":
+        headers["Content-Security-Policy"] = SANDBOX
+    return FileResponse(path, headers=headers)
 
 
 def view(request: Request) -> Response:
@@ -207,16 +242,20 @@ def view(request: Request) -> Response:
 
 def go_on(request: Request) -> Response:
     """Start a run of `calib next`, or `calib redo`; where one is under way already, none."""
-    work, step = request.app.state.work, request.path_params.get("step", "")
+    work = request.app.state.work
+    step = request.path_params.get("step", "")
+    task = NEXT
     if step:
         find_step(open_session(work.folder), step)
-    work.ask(REDO if step else NEXT, step)
+        task = REDO
+    work.ask(task, step)
     return RedirectResponse("/", 303)
 
 
 async def bring(request: Request) -> Response:
     """Store uploaded files, and have them checked."""
-    work, kind = request.app.state.work, request.path_params["kind"]
+    work = request.app.state.work
+    kind = request.path_params["kind"]
     session = open_session(work.folder)
     if kind not in [name for name, _, _ in _kinds(session)]:
         return PlainTextResponse("this session takes no such files", 404)
@@ -230,7 +269,8 @@ async def bring(request: Request) -> Response:
 
 def set_aside(request: Request) -> Response:
     """Move what was brought into the folder ``aside`` beside it, where the session does not read it."""
-    work, name = request.app.state.work, request.path_params["name"]
+    work = request.app.state.work
+    name = request.path_params["name"]
     session = open_session(work.folder)
     for kind, _, names in _kinds(session):
         if name in names:

@@ -14,7 +14,8 @@ from calib.errors import UsageError, require
 from calib.toolkit.pose_data import IMAGES
 from calib.toolkit.sessions import BROUGHT, LOGS, Session
 
-BAG = "metadata.yaml"  # of a ROS bag, which is a folder
+# in the folder that is a ROS bag
+BAG = "metadata.yaml"
 
 
 def targets(session: Session, kind: str, names: list[str]) -> list[Path]:
@@ -24,22 +25,43 @@ def targets(session: Session, kind: str, names: list[str]) -> list[Path]:
         UsageError: for names by which the session would take them for something else, or nothing.
     """
     folder, prefix = BROUGHT[kind]
-    plain = [name.replace("\\", "/").rpartition("/")[2].lstrip(".") for name in names]
+    plain = []
+    for name in names:
+        last_part = name.replace("\\", "/").rpartition("/")[2]
+        plain.append(last_part.lstrip("."))
     distinct = all(plain) and len(set(plain)) == len(plain)
     require(distinct, "two files of one name, or one without: rename them", UsageError)
-    default = "_".join(filter(None, (prefix, "measured" if folder == "3-measured" else "log")))
-    if BAG in plain or (folder == "3-measured" and session.settings.instrument.measures == IMAGES):
+
+    subject = "log"
+    suffixes: tuple[str, ...] = (".csv",)
+    if folder == "3-measured":
+        subject = "measured"
+    elif folder == "7-recorded":
+        suffixes = LOGS
+    takes_images = folder == "3-measured" and session.settings.instrument.measures == IMAGES
+    if BAG in plain or takes_images:
+        # these stay together in a folder of their own
+        default = subject
+        if prefix:
+            default = f"{prefix}_{subject}"
         return [session.path(folder) / default / name for name in plain]
-    other_prefixes = tuple(start for where, start in BROUGHT.values() if where == folder and start not in ("", prefix))
+
+    other_prefixes = []
+    for other_folder, other_prefix in BROUGHT.values():
+        if other_folder == folder and other_prefix not in ("", prefix):
+            other_prefixes.append(other_prefix)
+    paths = []
     for name in plain:
-        suffixes = LOGS if folder == "7-recorded" else (".csv",)
         message = f"{name}: expected {' or '.join(suffixes)}; nothing was stored"
         require(name.lower().endswith(suffixes), message, UsageError)
         for start in other_prefixes:
             message = f"{name}: a name that begins with '{start}' says other files; upload it there, or rename it"
             require(not name.lower().startswith(start), message, UsageError)
-    stored_names = [name if name.lower().startswith(prefix) else f"{prefix}_{name}" for name in plain]
-    return [session.path(folder) / name for name in stored_names]
+        stored_name = name
+        if not name.lower().startswith(prefix):
+            stored_name = f"{prefix}_{name}"
+        paths.append(session.path(folder) / stored_name)
+    return paths
 
 
 async def receive(session: Session, kind: str, content_type: str, chunks: AsyncIterator[bytes]) -> list[Path]:
@@ -52,11 +74,10 @@ async def receive(session: Session, kind: str, content_type: str, chunks: AsyncI
     """
     prefix, suffix = files.staged_name(Path("upload"))
     with tempfile.TemporaryDirectory(suffix, prefix, session.folder) as staging:
-        arrived, ended = list[File](), list[bool]()
+        arrived: list[File] = []
         config = {"UPLOAD_DIR": staging, "UPLOAD_DELETE_TMP": False, "MAX_MEMORY_FILE_SIZE": 0}
         try:
             parser = create_form_parser({"Content-Type": content_type.encode()}, None, arrived.append, config=config)
-            parser.on_end = lambda: ended.append(True)
             async for chunk in chunks:
                 parser.write(chunk)
             parser.finalize()
@@ -67,11 +88,14 @@ async def receive(session: Session, kind: str, content_type: str, chunks: AsyncI
                 upload.close()
         uploaded = [upload for upload in arrived if upload.size]
         require(uploaded, "no file was chosen, or it is empty", UsageError)
-        names = [(upload.file_name or b"").decode(errors="replace") for upload in uploaded]
-        places = targets(session, kind, names)
-        for upload, target in zip(uploaded, places):
-            target.parent.mkdir(exist_ok=True)
-            written = Path(os.fsdecode(upload.actual_file_name or b""))
-            written.chmod(0o666 & ~files.umask())
-            os.replace(written, target)
-    return places
+        names = []
+        for upload in uploaded:
+            file_name = upload.file_name or b""
+            names.append(file_name.decode(errors="replace"))
+        paths = targets(session, kind, names)
+        for upload, path in zip(uploaded, paths):
+            path.parent.mkdir(exist_ok=True)
+            staged = Path(os.fsdecode(upload.actual_file_name or b""))
+            staged.chmod(0o666 & ~files.umask())
+            os.replace(staged, path)
+    return paths

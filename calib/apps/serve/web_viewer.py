@@ -12,9 +12,11 @@ from urllib.parse import quote
 
 from calib.errors import CalibError, require
 
-LOCAL = ("127.0.0.1", "::1")  # who asks from this computer
-HERE = LOCAL[0]
-START = 20.0  # [s] that the viewer may take to answer (our choice)
+# who asks from this computer
+LOCAL = ("127.0.0.1", "::1")
+ADDRESS = LOCAL[0]
+# [s] that the viewer may take to answer (our choice)
+START_TIME = 20.0
 
 
 class WebViewer:
@@ -22,7 +24,9 @@ class WebViewer:
 
     def __init__(self) -> None:
         self.process: subprocess.Popen[bytes] | None = None
-        self.shown, self.address = (Path(), 0), ""
+        self.address = ""
+        # the recording that it shows, and when that was written
+        self.version = (Path(), 0)
 
     def address_of(self, recording: Path) -> str:
         """Return the address at which the viewer shows a recording.
@@ -31,36 +35,42 @@ class WebViewer:
             CalibError: where Rerun does not start.
         """
         version = recording, recording.stat().st_mtime_ns
-        if self.process is None or self.process.poll() is not None or self.shown != version:
+        if self.process is None or self.process.poll() is not None or self.version != version:
             self.close()
             pages, data = _free_ports(2)
-            ports = ["--bind", HERE, "--web-viewer-port", str(pages), "--port", str(data)]
+            ports = ["--bind", ADDRESS, "--web-viewer-port", str(pages), "--port", str(data)]
             command = [sys.executable, "-m", "rerun", "--serve-web", *ports, str(recording)]
             quiet = subprocess.DEVNULL
             self.process = subprocess.Popen(command, stdout=quiet, stderr=quiet, start_new_session=True)
             require(_answers(pages), f"Rerun's viewer does not start; try: calib view {recording.parent}", CalibError)
-            source = quote(f"rerun+http://{HERE}:{data}/proxy", safe="")
-            self.shown, self.address = version, f"http://{HERE}:{pages}/?url={source}"
+            source = quote(f"rerun+http://{ADDRESS}:{data}/proxy", safe="")
+            self.address = f"http://{ADDRESS}:{pages}/?url={source}"
+            self.version = version
         return self.address
 
     def close(self) -> None:
         """End the viewer."""
         if self.process is not None:
             with suppress(ProcessLookupError):
-                os.killpg(self.process.pid, signal.SIGKILL)  # Rerun's command starts its viewer as a process of its own
+                # Rerun's command starts its viewer as a process of its own
+                os.killpg(self.process.pid, signal.SIGKILL)
             self.process.wait()
 
 
 def _free_ports(count: int) -> list[int]:
     with ExitStack() as stack:
-        servers = [stack.enter_context(socket.create_server((HERE, 0))) for _ in range(count)]
-        return [server.getsockname()[1] for server in servers]
+        ports = []
+        # All stay open until each has its port, so that no two are the same.
+        for _ in range(count):
+            server = stack.enter_context(socket.create_server((ADDRESS, 0)))
+            ports.append(server.getsockname()[1])
+        return ports
 
 
 def _answers(port: int) -> bool:
-    end = time.monotonic() + START
+    end = time.monotonic() + START_TIME
     while time.monotonic() < end:
-        with suppress(OSError), socket.create_connection((HERE, port), 1.0):
+        with suppress(OSError), socket.create_connection((ADDRESS, port), 1.0):
             return True
         time.sleep(0.1)
     return False

@@ -7,9 +7,9 @@ import os
 import signal
 import time
 from collections import deque
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -23,7 +23,8 @@ from calib.workers.processes import end_with_parent
 
 CHECK, NEXT, REDO = "check", "next", "redo"
 INTERRUPTED = "it was interrupted; nothing is lost, continue from here"
-_spawned = get_context("spawn")  # a forked process has threads of libraries that are not there
+# a forked process has threads of libraries that are not there
+_spawned = get_context("spawn")
 
 
 @dataclass
@@ -87,16 +88,16 @@ class Work:
     def _begin(self) -> None:
         self.current = job = self._waiting.popleft()
         job.began = time.monotonic()
-        heard, telling = _spawned.Pipe(duplex=False)
-        self._process = _spawned.Process(target=_run, args=(telling, self.folder, job.task, job.subject))
+        receiver, sender = _spawned.Pipe(duplex=False)
+        self._process = _spawned.Process(target=_run, args=(sender, self.folder, job.task, job.subject))
         self._process.start()
-        telling.close()
-        Thread(target=self._listen, args=(job, heard, self._process), daemon=True).start()
+        sender.close()
+        Thread(target=self._listen, args=(job, receiver, self._process), daemon=True).start()
 
-    def _listen(self, job: Job, heard: Connection, process: Any) -> None:
+    def _listen(self, job: Job, receiver: Connection, process: Any) -> None:
         with suppress(EOFError, OSError):
             while True:
-                kind, text = heard.recv()
+                kind, text = receiver.recv()
                 if kind == "line":
                     job.lines.append(text)
                 else:
@@ -123,26 +124,32 @@ class Work:
             self._process.kill()
 
 
-def _run(telling: Connection, folder: Path, task: str, subject: str) -> None:
+def _run(sender: Connection, folder: Path, task: str, subject: str) -> None:
     """Do a job in its own process, and send what there is to say."""
     from calib.toolkit.sessions import go_on
 
-    def tell(kind: str) -> Callable[[object], None]:
-        return lambda text: telling.send((kind, str(text)))
+    def send(kind: str, text: object) -> None:
+        sender.send((kind, str(text)))
 
     Thread(target=end_with_parent, daemon=True).start()
-    typed = command_line("serve", folder)
+    say = partial(send, "line")
+    command = command_line("serve", folder)
     try:
         if task == CHECK:
             for line in checked(open_session(folder), subject):
-                tell("line")(line)
+                say(line)
+        elif task == REDO:
+            go_on(folder, say, partial(send, "words"), command, subject)
         else:
-            go_on(folder, tell("line"), tell("words"), typed, subject if task == REDO else "")
+            go_on(folder, say, partial(send, "words"), command)
     except KeyboardInterrupt:
-        tell("problem")(INTERRUPTED)
+        send("problem", INTERRUPTED)
     except Exception as error:
         foreseen = complaint(error)
-        tell("problem")(foreseen[0] if foreseen else bug_reports.report(error, [typed], folder))
+        if foreseen:
+            send("problem", foreseen[0])
+        else:
+            send("problem", bug_reports.report(error, [command], folder))
 
 
 def checked(session: Session, kind: str) -> list[str]:
@@ -157,10 +164,18 @@ def checked(session: Session, kind: str) -> list[str]:
     if kind in ("training", "unseen"):
         if not session.fit.robot.exists():
             return ["the logs are checked once the geometry is fitted"]
-        motion = "training" if kind == "training" else "validation"
-        return [note for path in paths for note in check_recording(session, path, motion)[1]]
+        motion = "validation"
+        if kind == "training":
+            motion = "training"
+        notes = []
+        for path in paths:
+            notes += check_recording(session, path, motion)[1]
+        return notes
     chain = chain_of(session)
     blocks = read_measured(session, chain, paths)
     if kind == "drift":
         return [f"{name}: {len(block)} rows" for name, block in blocks]
-    return notes_on(session, chain, blocks, POSES if kind == "measured" else UNSEEN)
+    plan = UNSEEN
+    if kind == "measured":
+        plan = POSES
+    return [str(note) for note in notes_on(session, chain, blocks, plan)]

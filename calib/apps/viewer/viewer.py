@@ -4,12 +4,14 @@ Everything plays on one clock, the timeline ``time``, in the order of the work: 
 one by one, motions, torques; poses last `EACH`, motions as long as they are. Poses have timelines of their own beside.
 """
 
+from __future__ import annotations
+
 import os
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,6 +21,9 @@ from calib.toolkit.chains import Chain, Joint, joint_frames
 from calib.toolkit.result_folders import DrawnRobot as Drawn
 from calib.toolkit.result_folders import ErrorSizes, Measured, Played, Scene, Torques, drawn, strips, thinned
 from calib.transforms import to_quaternion
+
+if TYPE_CHECKING:
+    from rerun import RecordingStream, TimeColumn
 
 # colours, red, green and blue
 ARM = [90, 100, 115]
@@ -96,7 +101,7 @@ def spawn(folder: str | Path, robot: str | None = None) -> Scene:
     return scene
 
 
-def _send(recording: Any, scene: Scene) -> None:
+def _send(recording: RecordingStream, scene: Scene) -> None:
     """Write all parts of a scene into a Rerun recording."""
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     recording.log("about", rr.TextDocument(about(scene), media_type="text/markdown"), static=True)
@@ -166,7 +171,7 @@ def _rms_mm(sizes: np.ndarray) -> str:
     return f"{_rms(errors_mm):.3f} mm"
 
 
-def _poses(name: str, count: int, start: float, selection: np.ndarray | None = None) -> list[Any]:
+def _poses(name: str, count: int, start: float, selection: np.ndarray | None = None) -> list[TimeColumn]:
     """Return the time columns of `count` poses, or those selected: the common clock from `start` [s], and a counter."""
     steps = np.arange(1, count + 1)
     if selection is not None:
@@ -174,7 +179,7 @@ def _poses(name: str, count: int, start: float, selection: np.ndarray | None = N
     return [rr.TimeColumn("time", duration=start + EACH * steps), rr.TimeColumn(name, sequence=steps)]
 
 
-def _measured(recording: Any, scene: Scene, measured: Measured, start: float) -> float:
+def _measured(recording: RecordingStream, scene: Scene, measured: Measured, start: float) -> float:
     """Log points and error arrows, together and pose by pose; return the start time of the next part [s]."""
     if not len(measured.q) or scene.chain is None:
         return start
@@ -214,7 +219,7 @@ def _measured(recording: Any, scene: Scene, measured: Measured, start: float) ->
     return start + EACH * count + GAP
 
 
-def _sizes(recording: Any, scene: Scene, sizes: ErrorSizes, start: float) -> float:
+def _sizes(recording: RecordingStream, scene: Scene, sizes: ErrorSizes, start: float) -> float:
     """Log the sizes of errors row by row, with the arm at each; return the start time of the next part [s]."""
     count = len(sizes.q)
     entity = f"errors/{sizes.kind}"
@@ -233,7 +238,9 @@ def _sizes(recording: Any, scene: Scene, sizes: ErrorSizes, start: float) -> flo
     return start + EACH * count + GAP
 
 
-def _chosen(recording: Any, scene: Scene, chain: Chain | Drawn, name: str, q: np.ndarray, start: float) -> float:
+def _chosen(
+    recording: RecordingStream, scene: Scene, chain: Chain | Drawn, name: str, q: np.ndarray, start: float
+) -> float:
     """Log a pose plan as it grows: one more tool position each step, and the arm at the newest pose."""
     tips = strips(chain, q)[0][:, -1]
     counts = np.arange(1, len(q) + 1)
@@ -247,7 +254,7 @@ def _chosen(recording: Any, scene: Scene, chain: Chain | Drawn, name: str, q: np
     return start + EACH * len(q) + GAP
 
 
-def _played(recording: Any, scene: Scene, played: Played, start: float) -> float:
+def _played(recording: RecordingStream, scene: Scene, played: Played, start: float) -> float:
     """Log a motion with its limits from `start` on [s], and return the start time of the next part."""
     t = start + played.t - played.t[0]
     samples = thinned(played.t)
@@ -265,7 +272,7 @@ def _played(recording: Any, scene: Scene, played: Played, start: float) -> float
     return float(t[-1]) + GAP
 
 
-def _limits(recording: Any, joint: Joint, name: str, ends: np.ndarray, velocities: bool) -> None:
+def _limits(recording: RecordingStream, joint: Joint, name: str, ends: np.ndarray, velocities: bool) -> None:
     """Log a joint's limits, where it has any, as lines over a motion's first and last time (2,) [s]."""
     index = [rr.TimeColumn("time", duration=ends)]
     limits = [("position", "lower", joint.lower), ("position", "upper", joint.upper)]
@@ -277,7 +284,7 @@ def _limits(recording: Any, joint: Joint, name: str, ends: np.ndarray, velocitie
             _series(recording, entity, index, [value, value], f"{name} {side}", LIMIT)
 
 
-def _torques(recording: Any, scene: Scene, torques: Torques, start: float) -> float:
+def _torques(recording: RecordingStream, scene: Scene, torques: Torques, start: float) -> float:
     """Log measured torques, predicted torques and residuals, with the arm on the same time axis."""
     t = start + torques.t - torques.t[0]
     index = [rr.TimeColumn("time", duration=t)]
@@ -300,7 +307,12 @@ def _part(name: str) -> str:
 
 
 def _series(
-    recording: Any, path: str, index: list[Any], values: Sequence[float] | np.ndarray, name: str, colour: Any = None
+    recording: RecordingStream,
+    path: str,
+    index: list[TimeColumn],
+    values: Sequence[float] | np.ndarray,
+    name: str,
+    colour: Sequence[int] | None = None,
 ) -> None:
     """Log one line of a plot with its legend."""
     style = {}
@@ -311,7 +323,7 @@ def _series(
     recording.send_columns(path, indexes=index, columns=scalars)
 
 
-def _arm(recording: Any, scene: Scene, index: list[Any], q: np.ndarray) -> None:
+def _arm(recording: RecordingStream, scene: Scene, index: list[TimeColumn], q: np.ndarray) -> None:
     """Log the arm's links as lines, and its links' frames where it has meshes."""
     if scene.chain is None or q.shape[1] != scene.chain.n:
         return
@@ -343,7 +355,7 @@ def _arm(recording: Any, scene: Scene, index: list[Any], q: np.ndarray) -> None:
             recording.send_columns(f"world/robot/links/{_part(link)}", indexes=index, columns=motion)
 
 
-def _meshes(recording: Any, scene: Scene) -> None:
+def _meshes(recording: RecordingStream, scene: Scene) -> None:
     """Log the meshes, each once, under the frame of its link."""
     for number, mesh in enumerate(scene.meshes):
         entity = f"world/robot/links/{_part(mesh.link)}/mesh_{number}"

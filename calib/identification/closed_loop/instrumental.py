@@ -272,7 +272,7 @@ def identify_instrumental(
         raise CannotSimulate(str(error), error.last) from error
     # of the last step, and how often it was halved afterwards
     start, returns = plant, 0
-    for _ in range(limit):
+    while True:
         estimate = _estimate_round(task, runs, std, tau)
         task = task.after(estimate)
         residual_std = estimate.fit.estimate.residual_std
@@ -293,6 +293,8 @@ def identify_instrumental(
         before = estimate.fit
         std = estimate.fit.group_std
         tau = estimate.tau
+        if len(rounds) >= limit:
+            break
     change_percent = 100 * rounds[-1].change
     message = (
         f"instruments from simulation: parameters still change by {change_percent:.3g} % after {limit} "

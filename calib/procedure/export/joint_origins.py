@@ -7,11 +7,11 @@ YAML 1.1 takes 1e-05 for text; a key that could be read as something else is quo
 import json
 import re
 from collections.abc import Mapping
+from typing import cast
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from calib.config_types import ParsedTable
 from calib.errors import refuse_robot
 from calib.robot.formats.urdf_tree import read as read_tree
 
@@ -19,7 +19,7 @@ _PLAIN = re.compile(r"[A-Za-z_][\w./-]*", re.ASCII)
 _WORDS = {"yes", "no", "on", "off", "true", "false", "null"}  # no texts in YAML 1.1, in any case
 
 
-def block(value: ParsedTable, indent: str = "") -> str:
+def block(value: Mapping[str, object], indent: str = "") -> str:
     """Return the YAML lines of a mapping from texts to mappings, texts and finite floats."""
     lines = []
     for key, item in value.items():
@@ -31,10 +31,10 @@ def block(value: ParsedTable, indent: str = "") -> str:
     return "".join(lines)
 
 
-def _scalar(value: float | str) -> str:
+def _scalar(value: object) -> str:
     if isinstance(value, str):
         return _text(value)
-    digits, e, exponent = repr(float(value)).partition("e")
+    digits, e, exponent = repr(float(cast(float, value))).partition("e")
     return digits + ("" if "." in digits else ".0") + e + exponent
 
 

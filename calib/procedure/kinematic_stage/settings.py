@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from calib.arguments import checked
-from calib.config_types import Expect, Flag, Holdout, OneOf, Positive, Real, Seed, Text, Typed, Whole
+from calib.config_types import Expect, Flag, Holdout, OneOf, Positive, Real, Seed, Text, Tolerance, Whole
 from calib.data.poses import MIN_SIGMA, Loss, Model
 from calib.procedure.measuring import DEFAULT_RUN, RunSettings
 
@@ -14,7 +14,6 @@ DELIVERABLES = ("urdf", "corrections")
 Coordinate = Annotated[float, Real(least=-100.0, most=100.0, unit="m", quantity="length")]
 Point = Annotated[tuple[Coordinate, Coordinate, Coordinate], Expect("x,y,z [m]")]
 Sigma = Annotated[float, Real(above=0.0, least=MIN_SIGMA, most=10.0, unit="m or rad", quantity="1")]
-Tolerance = Annotated[float, Real(above=0.0, quantity="length"), Typed(unit="mm")] | None
 Stations = Annotated[str, OneOf(("each", "one"))]
 Deliverable = Annotated[str, OneOf(DELIVERABLES)]
 Index = Annotated[str, OneOf("calib.poses.indices:Index")]

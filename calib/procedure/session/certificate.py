@@ -172,7 +172,7 @@ def _with_arrival(stage: StageRecord, lines: list[str]) -> StageRecord:
     present: set[str] = set()
     for block in blocks:
         if isinstance(block, Text):
-            present.update(block.lines)
+            present.update(map(str, block.lines))
     missing = [line for line in dict.fromkeys(lines) if line not in present]
     notes = Text("Notes on the files when they were read", missing)
     return replace(stage, section=replace(stage.section, blocks=[*blocks, notes]))

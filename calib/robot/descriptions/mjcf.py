@@ -20,9 +20,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from calib.errors import RobotError, refuse_robot
+from calib.robot.formats.native import NativeModel
 from calib.robot.formats.urdf_tree import UNLIMITED
 from calib.robot.formats.urdf_write import MOMENTS, add_joint, numbers_text, xml_text
-from calib.robot.native import NativeModel
 from calib.transforms import from_quaternion, invert, pose
 
 WORLD = "world"

@@ -18,9 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from calib.errors import RobotError, refused_as
 from calib.robot.chain import AXES, Chain
+from calib.robot.formats.native import NativeModel
 from calib.robot.formats.urdf_write import centred, numbers_text, xml_text
 from calib.robot.kinematics import moving_frames
-from calib.robot.native import NativeModel
 from calib.transforms import invert
 
 

@@ -26,7 +26,7 @@ RATE, WIDTH, FREQUENCY = 1000.0, 0.5, 3.0  # of the controller [Hz], of the Coul
 
 
 @cache
-def arm() -> tuple[Plant, controllers.Controller, controllers.Reference]:
+def arm() -> tuple[Plant, controllers.LoopController, controllers.Reference]:
     """Return the arm, a PD controller by its inertia, and what it is to follow for 20 s."""
     chain, known = load("lwr4plus"), known_robots.truth("lwr4plus")["drives"]
     terms = drives.standard([" ".join(known_robots.SIDED)] * chain.n, WIDTH)

@@ -41,7 +41,7 @@ def still(q: np.ndarray, duration: float, rate: float) -> Reference:
     return Reference(t, np.tile(q, (len(t), 1)), np.zeros((len(t), len(q))), np.zeros((len(t), len(q))))
 
 
-def free(n: int) -> controllers.Controller:
+def free(n: int) -> controllers.LoopController:
     return controllers.pd(np.zeros(n), np.zeros(n))
 
 

@@ -74,7 +74,7 @@ class RobotChange(ChartedResult, Judged):
     def _change_of(self, kind: str) -> Any:
         for part in self.parts:
             if part.kind == kind:
-                return part.found
+                return part.change
         return None
 
     def section(self) -> Section:
@@ -102,7 +102,7 @@ class RobotChange(ChartedResult, Judged):
             charts: dict[str, Chart] = {}
             if plots:
                 charts = part.charts()
-            parameters = (part.table, ParameterChange._fields, part.found.parameters)
+            parameters = (part.table, ParameterChange._fields, part.change.parameters)
             parts.append(pages.ResultPart(part.section(), charts, part.captions, parameters))
         earlier, later, robot = self._names
         setup = {"earlier": earlier, "later": later}
@@ -113,7 +113,7 @@ class RobotChange(ChartedResult, Judged):
         part = self.parts[0]
         return part.before.name, part.after.name, part.before.robot.chain.name
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, object]:
         """Return the numbers as in ``metrics.json`` [SI]."""
         before, after, _ = self._names
         numbers: dict[str, Any] = {

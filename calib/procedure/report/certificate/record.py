@@ -232,7 +232,7 @@ def _cells(figure: KeyFigure) -> tuple[str, ...]:
 
 def _cut(block: Text) -> Text:
     """Return a text of a certificate with at most `MAX_LINES` sentences of `MAX_LINE` letters; the report has all."""
-    lines = [shortened(_local(line), MAX_LINE) for line in block.lines]
+    lines = [shortened(_local(str(line)), MAX_LINE) for line in block.lines]
     if len(lines) > MAX_LINES:
         count = len(lines) - MAX_LINES + 1
         lines = [*lines[: MAX_LINES - 1], f"{count} more: see {REPORT}."]
