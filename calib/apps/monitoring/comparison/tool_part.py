@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -158,7 +158,7 @@ class ToolPart(ChangePart):
             charts["parameters"] = parameter_changes(rows, of="later - earlier")
         return charts
 
-    def numbers(self) -> dict[str, Any]:
+    def numbers(self) -> dict[str, object]:
         motions = {}
         for motion in self.change.motions:
             motions[motion.where] = {

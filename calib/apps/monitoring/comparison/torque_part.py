@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -160,7 +160,7 @@ class TorquePart(ChangePart):
         rows_of_panels = -(-len(panels) // 2)
         return {"torque": Chart(panels, 0.7 + 0.95 * rows_of_panels, 2, title=change.where, shared="x")}
 
-    def numbers(self) -> dict[str, Any]:
+    def numbers(self) -> dict[str, object]:
         torques = {}
         for change in self.change.torques:
             torques[change.where] = {
