@@ -45,7 +45,7 @@ from fnmatch import fnmatchcase
 from importlib import resources
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from annotated_types import MinLen
 
@@ -280,48 +280,41 @@ def _check_method(path: Path, key: str, name: str) -> None:
 
 def _expanded(study: StudyFile) -> list[Condition]:
     """Return the conditions of a study: all combinations of its values, each with a name."""
-    axes: dict[str, tuple[Any, ...]] = {
-        "robot": study.robot,
-        "motion": study.motion,
-        "rate": study.rate,
-        "noise": study.noise,
-        "decimation": study.decimation,
-        "cutoff": study.cutoff,
-        "mismatch": study.mismatch,
-    }
-    varied = [axis for axis, values in axes.items() if len(values) > 1]
+    axes = (study.robot, study.motion, study.rate, study.noise, study.decimation, study.cutoff, study.mismatch)
     conditions = []
-    for combination in product(*axes.values()):
-        values = dict(zip(axes, combination))
-        parts = [_name_part(axis, values[axis]) for axis in varied]
-        noise = values.pop("noise")
+    for robot, motion, rate, noise, decimation, cutoff, mismatch in product(*axes):
+        values = (robot, motion, _rate_name(rate), noise.name, f"r{decimation}", _cutoff_name(cutoff), mismatch)
+        # The name says the values of what varies.
+        parts = [value for value, axis in zip(values, axes) if len(axis) > 1]
         condition = Condition(
-            "-".join([study.name, *parts]),
+            name="-".join([study.name, *parts]),
+            robot=robot,
             sigma_q=noise.sigma_q,
             sigma_tau=noise.sigma_tau,
+            decimation=decimation,
+            cutoff=cutoff,
+            mismatch=mismatch,
             duration=study.duration,
             guess=study.guess,
-            guesses=study.guesses,
             resimulated=study.resimulated,
-            **values,
+            motion=motion,
+            rate=rate,
+            guesses=study.guesses,
         )
         conditions.append(condition)
     return conditions
 
 
-def _name_part(axis: str, value: object) -> str:
-    """Return how a value appears in the name of its condition."""
-    if axis in ("cutoff", "rate") and value:
-        return f"{value:g}Hz"
-    if axis == "cutoff":
-        return "unfiltered"
-    if axis == "rate":
-        return "own"
-    if axis == "decimation":
-        return f"r{value}"
-    if isinstance(value, Noise):
-        return value.name
-    return str(value)
+def _rate_name(rate: float) -> str:
+    if rate:
+        return f"{rate:g}Hz"
+    return "own"
+
+
+def _cutoff_name(cutoff: float) -> str:
+    if cutoff:
+        return f"{cutoff:g}Hz"
+    return "unfiltered"
 
 
 def _counts(study: StudyFile, methods: Sequence[str] | None, runs: int | None) -> dict[str, int]:
