@@ -22,7 +22,7 @@ FRAMES = 50.0
 
 @runtime_checkable
 class Drawn(Protocol):
-    """A robot that is not a serial arm, as its ``view`` (`calib.procedure.robot_kinds.Stage`) returns it.
+    """A robot that is not a serial arm, as its ``view`` (`calib.procedure.robot_kinds.CommandStage`) returns it.
 
     Attributes:
         n, joints, joint_names: its actuated joints.

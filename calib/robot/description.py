@@ -36,7 +36,7 @@ Implausible values of a description are reported: invalid limits, impossible bod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 
@@ -268,7 +268,7 @@ def write(path: str | Path, chain: Chain, extra: Mapping[str, object] | None = N
     return files.write(path, tables.dumps(head | table | dict(extra or {})))
 
 
-def from_elements(table: Mapping[str, Any], where: str) -> Chain:
+def from_elements(table: Mapping[str, object], where: str) -> Chain:
     """Return the chain of a parsed table of elements; `where` names it in messages."""
     file = parse(ElementsFile, table, where, RobotError)
     for key, entries in (("joint", file.joint), ("element", file.element)):

@@ -130,7 +130,7 @@ class MdhFile(tables.RobotTable):
     joint: tuple[RowTable, ...]
 
 
-def from_table(table: Mapping[str, Any], where: str, propose_beta: bool = True) -> Chain:
+def from_table(table: Mapping[str, object], where: str, propose_beta: bool = True) -> Chain:
     """Return the chain of a parsed table; `where` names it in messages."""
     file = parse(MdhFile, table, where, RobotError)
     if not file.joint:

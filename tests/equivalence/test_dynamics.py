@@ -101,7 +101,7 @@ def by_session(session: Session) -> Judgement:
     refused = refused or refusal(lambda: dynamics_steps.identify(session, quiet))
     if refused:
         return Judgement(refused=refused)
-    notes = dynamics_steps.predict(session, quiet)
+    notes = [str(note) for note in dynamics_steps.predict(session, quiet)]
     found = read(session.path("8-dynamics/unseen/report.json"))
     own, printed = read(session.path("8-dynamics/metrics.json")), dynamics_section.read(session.path("8-dynamics"))
     assert set(found["warnings"]) <= {*notes, *own["warnings"]}  # said by one of the two steps

@@ -1,12 +1,14 @@
 """Command for joint commands that reach nominal targets: compensate."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from calib.cli.shared import Out, Seed, command, numbers, progress, say
-from calib.records import FieldValues
+
+if TYPE_CHECKING:
+    from calib.records import FieldValues
 
 app = typer.Typer()
 

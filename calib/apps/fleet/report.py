@@ -327,8 +327,8 @@ def _findings(types: Sequence[ArmType], changes: Sequence[tuple[str, RobotChange
     findings = []
     for serial, change in changes:
         if change.verdict.level in ("marginal", "fail"):
-            moved = _tool_motion(change).rms
-            findings.append(finding("arm-drifts", arm=serial, moved=moved, reason=change.verdict.reason))
+            motion = _tool_motion(change)
+            findings.append(finding("arm-drifts", arm=serial, moved=motion.rms, reason=change.verdict.reason))
     for arm_type in types:
         share = len(arm_type.failed) / len(arm_type.arms)
         findings += [_failure(arm, share) for arm in arm_type.arms if arm.name in arm_type.failed]

@@ -203,13 +203,13 @@ def _name(session: Session, path: Path) -> str:
 
 def _files(session: Session) -> list[Path]:
     """Return the session's files, without hidden ones."""
-    shown = []
+    visible = []
     for path in sorted(session.folder.rglob("*")):
         parts = path.relative_to(session.folder).parts
         hidden = any(part.startswith(".") for part in parts)
         if path.is_file() and not hidden:
-            shown.append(path)
-    return shown
+            visible.append(path)
+    return visible
 
 
 def script(request: Request) -> Response:

@@ -122,13 +122,12 @@ def compare(
     """
     from calib import files
     from calib.apps.studies import method_comparison
-    from calib.apps.studies.method_comparison import caveats, compare_methods, write_table
+    from calib.apps.studies.method_comparison import ComparedMethod, caveats, compare_methods, write_table
     from calib.toolkit.model_identification import gather_recordings, read_identify_options
     from calib.toolkit.report_pages import printed_section
 
-    if out is None:
-        table = []
-    else:
+    table = []
+    if out is not None:
         table = [(out, (".csv",))]
     files.check_results(table, [robot, *recordings, *(validate or []), options], overwrite)
     names = _names(methods)
@@ -144,9 +143,11 @@ def compare(
             friction=friction,
             progress=progress,
         )
-        compared = compare_methods(
-            gathered, names, friction, progress, lambda method: say_line(method_comparison.line(method))
-        )
+
+        def say_method(method: ComparedMethod) -> None:
+            say_line(method_comparison.line(method))
+
+        compared = compare_methods(gathered, names, friction, progress, say_method)
     section = method_comparison.section(compared, caveats(gathered, compared))
     say(*printed_section(section), result=True)
     if out is not None:

@@ -216,7 +216,8 @@ def read_study(files: Sequence[str | Path], methods: Sequence[str] | None = None
                 "several files) different names"
             )
     _check_cutoffs(conditions)
-    name, about = study_files[0].name, study_files[0].about
+    name = study_files[0].name
+    about = study_files[0].about
     if len(study_files) > 1:
         name = f"{len(study_files)} studies"
         about = ", ".join(study.name for study in study_files)
@@ -310,10 +311,12 @@ def _expanded(study: StudyFile) -> list[Condition]:
 
 def _name_part(axis: str, value: object) -> str:
     """Return how a value appears in the name of its condition."""
+    if axis in ("cutoff", "rate") and value:
+        return f"{value:g}Hz"
     if axis == "cutoff":
-        return f"{value:g}Hz" if value else "unfiltered"
+        return "unfiltered"
     if axis == "rate":
-        return f"{value:g}Hz" if value else "own"
+        return "own"
     if axis == "decimation":
         return f"r{value}"
     if isinstance(value, Noise):
@@ -337,9 +340,11 @@ def _counts(study: StudyFile, methods: Sequence[str] | None, runs: int | None) -
 def _runs_of(study: StudyFile, name: str) -> int:
     """Return the number of runs that a file states for a method, or for its kind."""
     method = METHODS[name]
-    kind_runs = None
+    runs = None
     if method.needs_controller:
-        kind_runs = study.runs_loop
+        runs = study.runs_loop
     elif method.needs_simulation:
-        kind_runs = study.runs_filter
-    return study.runs_of.get(name, study.runs if kind_runs is None else kind_runs)
+        runs = study.runs_filter
+    if runs is None:
+        runs = study.runs
+    return study.runs_of.get(name, runs)

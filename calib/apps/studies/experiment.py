@@ -88,14 +88,14 @@ class Setup:
         chain: the arm as it is believed to be.
         plant: the robot as its maker describes it.
         reference: the motion, at the control rate.
-        other: the motion that validates.
+        validation: the motion that validates.
         every: control periods per sample, whole or not.
     """
 
     chain: Chain
     plant: Plant
     reference: Reference
-    other: Reference
+    validation: Reference
     every: float
 
 
@@ -193,7 +193,9 @@ def make_experiment(condition: Condition, seed: int) -> Experiment:
     """
     number, guess = divmod(seed, condition.guesses)
     data = data_set(condition, number)
-    guess_seed = guess if condition.guesses > 1 else seed
+    guess_seed = seed
+    if condition.guesses > 1:
+        guess_seed = guess
     values = _guess(set_up(condition).plant, condition.guess, guess_seed)
     problem = replace(data.problem, start=data.problem.base.transform @ values)
     if guess:
@@ -208,7 +210,8 @@ def data_set(condition: Condition, seed: int) -> Experiment:
     setup = set_up(condition)
     controller = published_controller(condition.robot)
     robots = _robots(condition, setup, seed)
-    model, base = robots.model, robots.base
+    model = robots.model
+    base = robots.base
     case = _recorded(condition, setup, robots.true, controller, seed)
     decimator = case.motion.decimator
     rows = observe(model, base.kept, case, decimator)
@@ -226,8 +229,8 @@ def data_set(condition: Condition, seed: int) -> Experiment:
         constraints=ConstraintSettings(bodies=True),
     )
     part = slice(None, None, THIN)
-    other = setup.other
-    validation = Reference(other.t[part], other.q[part], other.v[part], other.a[part])
+    motion = setup.validation
+    validation = Reference(motion.t[part], motion.q[part], motion.v[part], motion.a[part])
     matrix = model.regressor(validation.q, validation.v, validation.a)[:, :, base.kept]
     # A payload that nobody knows of is no part of the robot that the model shall predict.
     if condition.mismatch == "payload":
@@ -256,7 +259,8 @@ class _Robots:
 
 def _robots(condition: Condition, setup: Setup, seed: int) -> _Robots:
     """Return the true robot, the assumed model with its base, and the robot with the model's parameters."""
-    plant, chain = setup.plant, setup.chain
+    plant = setup.plant
+    chain = setup.chain
     robots = _Robots(plant, plant_model(plant), _nominal_base(condition.robot), plant)
     if condition.mismatch in ("geometry", "calibrated"):
         cell = rigid(perturbed_cell(chain, seed, SimulatedInstrument(), size=DRAWING_ERROR))
@@ -309,7 +313,9 @@ def _recorded(condition: Condition, setup: Setup, true: Plant, controller: LoopC
 
 def _loop(condition: Condition, controller: LoopController) -> LoopSettings:
     """Return the loop settings for the methods, with the errors of the condition."""
-    kp, kd = BELIEVED if condition.mismatch == "controller" else (1.0, 1.0)
+    kp = kd = 1.0
+    if condition.mismatch == "controller":
+        kp, kd = BELIEVED
     truth = known_truth(condition.robot)
     believed_kp = tuple(kp * controller.kp)
     believed_kd = tuple(kd * controller.kd)

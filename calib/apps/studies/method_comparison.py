@@ -34,7 +34,10 @@ from calib.toolkit.result_folders import Note, Verdict, as_notes, lines_of, note
 from calib.toolkit.torque_models import METHODS, Case, IdentificationSettings, Method, method_named, predict
 
 # Of the rule above (our choices).
-MAX_SIGMAS, MAX_SHARE, MAX_TIMES, FAST_SECONDS = 2.0, 0.05, 2.0, 1.0
+MAX_SIGMAS = 2.0
+MAX_SHARE = 0.05
+MAX_TIMES = 2.0
+FAST_SECONDS = 1.0
 # Blocks of time in each recording, for the jackknife (our choice).
 TIME_BLOCKS = 10
 LOOP = "needs the closed loop: add [loop] to the options file (calib formats identify-options)"
@@ -92,12 +95,16 @@ class _Sums:
     raw_size: np.ndarray
 
 
+def _ignore(message: object) -> None:
+    pass
+
+
 def compare_methods(
     inputs: IdentificationInputs,
     methods: Sequence[str] | None = None,
     friction: str = "standard",
-    say: Callable[[str], None] = lambda message: None,
-    done: Callable[[ComparedMethod], None] = lambda method: None,
+    say: Callable[[str], None] = _ignore,
+    done: Callable[[ComparedMethod], None] = _ignore,
 ) -> list[ComparedMethod]:
     """Return the results of all methods on the recordings, best first; failed methods come last.
 
@@ -251,7 +258,10 @@ def _errors(model: Identification, inputs: IdentificationInputs, same_unit: np.n
 
 def _sums(model: Identification, cases: Sequence[Case]) -> _Sums:
     """Return the sums of a model's errors over each block of time of the recordings."""
-    errors, sizes, raw_errors, raw_sizes = [], [], [], []
+    errors = []
+    sizes = []
+    raw_errors = []
+    raw_sizes = []
     for case in cases:
         motion = case.motion
         usable = motion.weight > 0.5
@@ -286,11 +296,15 @@ def _jackknife(values: np.ndarray) -> float:
     return float(np.sqrt((count - 1) / count * np.sum((values - values.mean()) ** 2)))
 
 
+def _unseen_error(result: tuple[ComparedMethod, _Sums]) -> float:
+    return result[0].unseen
+
+
 def _ranked(results: Sequence[tuple[ComparedMethod, _Sums]], same_unit: np.ndarray) -> list[ComparedMethod]:
     """Return the methods by rank; the first fast one of the good methods is marked as chosen."""
     if not results:
         return []
-    order = sorted(results, key=lambda result: result[0].unseen)
+    order = sorted(results, key=_unseen_error)
     best, best_sums = order[0]
     ranked = []
     for rank, (method, sums) in enumerate(order, 1):
@@ -344,8 +358,8 @@ def write_table(compared: Sequence[ComparedMethod], path: Path) -> Path:
             worst_error,
             method.behind,
             method.behind_sigma,
-            "yes" if method.good else "no",
-            "yes" if method.chosen else "no",
+            _yes_or_no(method.good),
+            _yes_or_no(method.chosen),
             method.parameters,
             method.seconds,
             method.iterations,
@@ -356,14 +370,24 @@ def write_table(compared: Sequence[ComparedMethod], path: Path) -> Path:
     return files.write_table(path, HEADER, lines)
 
 
+def _yes_or_no(value: bool) -> str:
+    if value:
+        return "yes"
+    return "no"
+
+
 def _behind(method: ComparedMethod) -> str:
-    return "" if method.rank == 1 else f"{method.behind:.2g} ± {method.behind_sigma:.2g}"
+    if method.rank == 1:
+        return ""
+    return f"{method.behind:.2g} ± {method.behind_sigma:.2g}"
 
 
 def _choice(method: ComparedMethod) -> str:
     if method.chosen:
         return "take"
-    return "as good" if method.good else ""
+    if method.good:
+        return "as good"
+    return ""
 
 
 COLUMNS = (

@@ -12,6 +12,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -58,7 +59,8 @@ MEANING = (
 )
 
 # Results of a study beside its rows, and all files that it owns.
-SUMMARY, REPORT = "summary.csv", "report.html"
+SUMMARY = "summary.csv"
+REPORT = "report.html"
 OURS = (ROWS, LOCK, SUMMARY, REPORT)
 
 
@@ -70,7 +72,9 @@ def boxes(condition: ConditionSummary, rows: Sequence[TrialRow]) -> Picture:
         method_rows = [row for row in rows if row.method == method.method]
         errors = [row.torque_error for row in method_rows if np.isfinite(row.torque_error)]
         all_errors += errors
-        colour = AFTER if method.as_good else BEFORE
+        colour = BEFORE
+        if method.as_good:
+            colour = AFTER
         if len(errors) < MIN_DATA_SETS:
             layers.append(line(errors, [height] * len(errors), "o", colour, size=4.0))
         else:
@@ -96,7 +100,9 @@ def _short(value: float) -> str:
         return "–"
     if math.isinf(value):
         return "∞"
-    return f"{value:.3g}" if abs(value) < 1e5 else f"{value:.1e}"
+    if abs(value) < 1e5:
+        return f"{value:.3g}"
+    return f"{value:.1e}"
 
 
 def _median(header: str, figure: str) -> RecordColumn:
@@ -122,7 +128,19 @@ def _mark(method: MethodSummary) -> str:
         return "take"
     if method.as_good:
         return "as good"
-    return "" if method.enough else "few runs"
+    if method.enough:
+        return ""
+    return "few runs"
+
+
+def _yes_or_no(value: bool) -> str:
+    if value:
+        return "yes"
+    return "no"
+
+
+def _is_chosen(method: MethodSummary) -> bool:
+    return method.chosen
 
 
 COLUMNS = (
@@ -175,10 +193,11 @@ def overview(conditions: Sequence[ConditionSummary]) -> ReportTable:
 
 def torque_table(conditions: Sequence[ConditionSummary]) -> ReportTable:
     """Return a table of the median torque error of every method on every condition."""
-    # A dictionary keeps the order of names, and each once.
-    names: dict[str, None] = {}
+    names: list[str] = []
     for summary in conditions:
-        names.update((method.method, None) for method in summary.methods)
+        for method in summary.methods:
+            if method.method not in names:
+                names.append(method.method)
     lines = []
     for summary in conditions:
         by_name = {method.method: method for method in summary.methods}
@@ -198,7 +217,9 @@ def _median_cell(method: MethodSummary | None) -> str:
     median = _short(method.figures["torque_error"].median)
     if method.chosen:
         return f"{median}*"
-    return median if method.enough else f"{median} ({method.trials})"
+    if method.enough:
+        return median
+    return f"{median} ({method.trials})"
 
 
 def reasons(conditions: Sequence[ConditionSummary]) -> list[str]:
@@ -224,7 +245,9 @@ def _described(condition: Condition) -> str:
         parts.append(condition.motion)
     if condition.rate:
         parts.append(f"{condition.rate:g} Hz")
-    cutoff = f"{condition.cutoff:g} Hz" if condition.cutoff else "unfiltered"
+    cutoff = "unfiltered"
+    if condition.cutoff:
+        cutoff = f"{condition.cutoff:g} Hz"
     degrees = math.degrees(condition.sigma_q)
     noise = f"{degrees:.3g}°, {condition.sigma_tau:g} N·m"
     description = f"{' '.join(parts)}, {noise}, r = {condition.decimation}, {cutoff}"
@@ -239,13 +262,13 @@ def condition_table(summary: ConditionSummary, names: Sequence[str] = ON_CONSOLE
     """Return a table of all methods on a condition, best first; by default with the columns for a terminal."""
     columns = [column for column in COLUMNS if column.name in names]
     title = f"Methods on {summary.condition.name}"
-    return table(title, columns, summary.methods, _described(summary.condition), lambda method: method.chosen)
+    return table(title, columns, summary.methods, _described(summary.condition), _is_chosen)
 
 
 def failures(summary: ConditionSummary) -> list[Text]:
     """Return the failures of each method on a condition: kind, number, and first message; empty without any."""
     lines = []
-    for method in sorted(summary.methods, key=lambda method: method.method):
+    for method in sorted(summary.methods, key=attrgetter("method")):
         for status, count in method.failures.items():
             lines.append(f"{method.method}: {count} {status}, e.g. {method.examples[status]}")
     if lines:
@@ -262,10 +285,8 @@ def summary_table(conditions: Sequence[ConditionSummary]) -> tuple[list[str], li
     for summary in conditions:
         for method in summary.methods:
             failed = sum(method.failures.values())
-            as_good = "yes" if method.as_good else "no"
-            chosen = "yes" if method.chosen else "no"
-            cells = [summary.condition.name, method.method, method.trials, failed, method.rank, as_good, chosen]
-            cells.append(method.p)
+            cells: list[object] = [summary.condition.name, method.method, method.trials, failed, method.rank]
+            cells += [_yes_or_no(method.as_good), _yes_or_no(method.chosen), method.p]
             for figure in FIGURES:
                 cells.extend(method.figures[figure])
             lines.append(cells)
@@ -342,6 +363,10 @@ class StudyOutcome:
         return lines
 
 
+def _silent(message: str) -> None:
+    pass
+
+
 def run_study(
     studies: Sequence[str | Path],
     out: Path,
@@ -351,7 +376,7 @@ def run_study(
     where: str | int | None = None,
     report_only: bool = False,
     plots: bool = True,
-    say: Callable[[str], None] = lambda message: None,
+    say: Callable[[str], None] = _silent,
 ) -> StudyOutcome:
     """Run the missing trials of a study, and write its report.
 
@@ -370,7 +395,8 @@ def run_study(
     """
     study = read_study(studies, methods, runs)
     _check_folder(out, studies)
-    progress, stored = Progress(0), ""
+    progress = Progress(0)
+    stored = ""
     if report_only:
         # Takes no lock: a study that runs there may be looked at.
         rows = read_rows(out)
@@ -384,7 +410,10 @@ def run_study(
             stored = f"{ROWS} holds {len(rows)} rows"
     counted, notes = _counted(study, rows)
     if not progress.lost and not counted:
-        contents = "; ".join([f"{len(rows)} rows" if rows else "no rows", *notes])
+        contents = "no rows"
+        if rows:
+            contents = f"{len(rows)} rows"
+        contents = "; ".join([contents, *notes])
         advice = "ask for 1 run or more (--runs)"
         if report_only:
             advice = "run the study first, or name its folder (--out)"

@@ -75,7 +75,9 @@ def span(seconds: float) -> str:
     """Return a duration as text: 40 s, 12 min, 3.1 h."""
     if seconds < 90:
         return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+    if seconds < 5400:
+        return f"{seconds / 60:.0f} min"
+    return f"{seconds / 3600:.1f} h"
 
 
 def _missing(study: Study, store: RowStore) -> Iterator[Trials]:
@@ -83,7 +85,9 @@ def _missing(study: Study, store: RowStore) -> Iterator[Trials]:
 
     Methods that take no start values run once per data set, the others from each guess.
     """
-    data_sets = max((max(runs.values(), default=0) for runs in study.runs), default=0)
+    data_sets = 0
+    for runs in study.runs:
+        data_sets = max(data_sets, *runs.values(), 0)
     for number in range(data_sets):
         for condition, runs, first in zip(study.conditions, study.runs, study.seeds):
             digest = condition.digest

@@ -23,7 +23,10 @@ from calib.apps.studies.conditions import Condition, Study
 from calib.apps.studies.trial import TrialRow
 
 # The rule's shares and factor (our choices), see above.
-RELIABLE, LEVEL, SLACK, ALIKE = 0.95, 0.05, 0.05, 2.0
+RELIABLE = 0.95
+LEVEL = 0.05
+SLACK = 0.05
+ALIKE = 2.0
 # Common data sets below which the sign test cannot tell at 5 %.
 MIN_DATA_SETS = 6
 # Error of a trial without an estimate.
@@ -103,12 +106,18 @@ class ConditionSummary:
     @property
     def chosen(self) -> MethodSummary | None:
         """The recommended method; None if none is reliable."""
-        return next((method for method in self.methods if method.chosen), None)
+        for method in self.methods:
+            if method.chosen:
+                return method
+        return None
 
     @property
     def best(self) -> MethodSummary | None:
         """The best method with enough runs and an estimate; None without any."""
-        return next((method for method in self.methods if method.enough and method.estimates), None)
+        for method in self.methods:
+            if method.enough and method.estimates:
+                return method
+        return None
 
     @property
     def why_none(self) -> str:
@@ -136,7 +145,8 @@ def summarise(study: Study, rows: Iterable[TrialRow]) -> list[ConditionSummary]:
         by_method = by_digest.get(condition.digest, {})
         # Methods of the study first, in its order; each once.
         names = dict.fromkeys((*runs, *by_method))
-        summaries.append(_ranked(condition, {name: by_method[name] for name in names if name in by_method}))
+        stored = {name: by_method[name] for name in names if name in by_method}
+        summaries.append(_ranked(condition, stored))
     return summaries
 
 
@@ -157,7 +167,11 @@ def _ranked(condition: Condition, rows: Mapping[str, Sequence[TrialRow]]) -> Con
                 else:
                     errors[name][row.seed] = FAILED_ERROR
     summaries.sort(key=lambda method: (not method.reliable, method.figures["torque_error"].median))
-    best = next((method for method in summaries if method.enough), None)
+    best = None
+    for method in summaries:
+        if method.enough:
+            best = method
+            break
     ranked = []
     for rank, method in enumerate(summaries, 1):
         if best is None or method is best or not method.enough:
@@ -168,7 +182,8 @@ def _ranked(condition: Condition, rows: Mapping[str, Sequence[TrialRow]]) -> Con
         within_slack = _median_ratio(errors[method.method], errors[best.method]) <= 1.0 + SLACK
         as_good = method.reliable and best.reliable and (within_slack or p > LEVEL)
         ranked.append(replace(method, rank=rank, as_good=as_good, p=p))
-    cheapest = min((method.figures["cpu"].median for method in ranked if method.as_good), default=0.0)
+    times = [method.figures["cpu"].median for method in ranked if method.as_good]
+    cheapest = min(times, default=0.0)
     chosen = None
     for method in ranked:
         # Also true for a time that is NaN.

@@ -16,7 +16,8 @@ from calib.toolkit.torque_models import VERSIONS, Dynamics, EstimateStatus, Meth
 
 FOUND = EstimateStatus.FOUND.value
 # Beside `EstimateStatus`: the true robot, or the method, raised an error.
-NOT_RECORDED, FAILED = "not recorded", "failed"
+NOT_RECORDED = "not recorded"
+FAILED = "failed"
 STATUSES = (*(status.value for status in EstimateStatus), NOT_RECORDED, FAILED)
 NAN = float("nan")
 # Between the versions of toolkit and method.
@@ -129,7 +130,8 @@ def run_trial(condition: Condition, method: str, seed: int) -> TrialRow:
     estimator = method_named(method)
     try:
         data = make_experiment(condition, seed)
-    except Exception as error:  # an unstable loop, a geometry that cannot be fitted: a finding, not an end
+    except Exception as error:
+        # An unstable loop, or a geometry that cannot be fitted, is a finding, not an end.
         return TrialRow(status=NOT_RECORDED, message=_message(error), **head)
     wall, cpu = time.perf_counter(), time.process_time()
     outcome: MethodEstimate | None = None
@@ -195,9 +197,11 @@ def _resimulated(condition: Condition, data: Experiment, values: np.ndarray, see
     """Return the survey's position error d_q [%] of an estimate, simulated again without noise; NaN if unavailable."""
     if seed // condition.guesses >= condition.resimulated:
         return NAN
-    setup, problem, model = set_up(condition), data.problem, data.model
-    plant = Plant(model.bodies, model.terms, problem.base.to_standard(values))
-    controller, sensing = published_controller(condition.robot), Sensing(every=setup.every)
+    setup = set_up(condition)
+    problem = data.problem
+    plant = Plant(data.model.bodies, data.model.terms, problem.base.to_standard(values))
+    controller = published_controller(condition.robot)
+    sensing = Sensing(every=setup.every)
     try:
         run = simulate(plant, controller, setup.reference, sensing)
     except CalibError:
@@ -226,7 +230,9 @@ def _version(method: str) -> str:
         toolkit = version("armature-calib")
     except PackageNotFoundError:
         toolkit = ""
-    return toolkit if VERSIONS[method] == 1 else f"{toolkit}{_CHANGED}{VERSIONS[method]}"
+    if VERSIONS[method] == 1:
+        return toolkit
+    return f"{toolkit}{_CHANGED}{VERSIONS[method]}"
 
 
 def grouped(condition: Condition, methods: Sequence[str], seed: int) -> list[Trials]:

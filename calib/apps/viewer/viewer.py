@@ -171,7 +171,7 @@ def _rms_mm(sizes: np.ndarray) -> str:
     return f"{_rms(errors_mm):.3f} mm"
 
 
-def _poses(name: str, count: int, start: float, selection: np.ndarray | None = None) -> list[Any]:
+def _poses(name: str, count: int, start: float, selection: np.ndarray | None = None) -> list[TimeColumn]:
     """Return the time columns of `count` poses, or those selected: the common clock from `start` [s], and a counter."""
     steps = np.arange(1, count + 1)
     if selection is not None:
@@ -272,7 +272,7 @@ def _played(recording: RecordingStream, scene: Scene, played: Played, start: flo
     return float(t[-1]) + GAP
 
 
-def _limits(recording: Any, joint: Joint, name: str, ends: np.ndarray, velocities: bool) -> None:
+def _limits(recording: RecordingStream, joint: Joint, name: str, ends: np.ndarray, velocities: bool) -> None:
     """Log a joint's limits, where it has any, as lines over a motion's first and last time (2,) [s]."""
     index = [rr.TimeColumn("time", duration=ends)]
     limits = [("position", "lower", joint.lower), ("position", "upper", joint.upper)]
@@ -284,7 +284,7 @@ def _limits(recording: Any, joint: Joint, name: str, ends: np.ndarray, velocitie
             _series(recording, entity, index, [value, value], f"{name} {side}", LIMIT)
 
 
-def _torques(recording: Any, scene: Scene, torques: Torques, start: float) -> float:
+def _torques(recording: RecordingStream, scene: Scene, torques: Torques, start: float) -> float:
     """Log measured torques, predicted torques and residuals, with the arm on the same time axis."""
     t = start + torques.t - torques.t[0]
     index = [rr.TimeColumn("time", duration=t)]

@@ -127,7 +127,7 @@ def planned(tmp_path: Path, q: np.ndarray) -> Session:
 
 def test_a_session_takes_points_alone_with_the_planned_joints(planned, arm, q):
     path = write(planned.path("3-measured/points.csv"), POINT, seen(arm, q)[SHUFFLED])
-    notes = arrive(planned, print)
+    notes = [str(note) for note in arrive(planned, print)]
     assert any("those of the planned poses are used, σ 0.1" in note for note in notes)
     missing = ", ".join(str(k + 1) for k in range(40) if k not in SHUFFLED)
     assert any(note.startswith(f"3 of 40 planned poses remain to be measured: {missing} (") for note in notes)
@@ -138,9 +138,9 @@ def test_a_session_takes_points_alone_with_the_planned_joints(planned, arm, q):
 def test_an_interrupted_run_goes_on_in_a_second_file(planned, arm, q):
     points = seen(arm, q)
     write(planned.path("3-measured/a.csv"), POINT, points[:25])
-    assert any("15 of 40 planned poses remain" in note for note in arrive(planned, print))
+    assert any("15 of 40 planned poses remain" in note.text for note in arrive(planned, print))
     write(planned.path("3-measured/b.csv"), POINT, points[:24:-1])
-    assert not any("remain" in note for note in arrive(planned, print))
+    assert not any("remain" in note.text for note in arrive(planned, print))
 
 
 def test_few_points_need_names(planned, arm, q):

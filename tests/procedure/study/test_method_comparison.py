@@ -51,10 +51,10 @@ def test_motion_that_was_learnt_from_ranks_nothing(robot: Path, tmp_path: Path):
     alone, beside = (gather(robot, [train], [tmp_path / "copy.npz", *more]) for more in ([], [other]))
     (found,) = compare_methods(alone, ["ols"])
     assert not found.chosen
-    assert "repeat the training motion" in caveats(alone, [found])[-1]
+    assert "repeat the training motion" in caveats(alone, [found])[-1].text
     (both,), (plain,) = compare_methods(beside, ["ols"]), compare_methods(gather(robot, [train], [other]), ["ols"])
     assert both.chosen and both.unseen == pytest.approx(plain.unseen)
-    assert "copy.npz" in caveats(beside, [both])[-1]
+    assert "copy.npz" in caveats(beside, [both])[-1].text
 
 
 def test_none_is_taken_that_predicts_no_better_than_no_model(robot: Path, tmp_path: Path):
@@ -64,7 +64,7 @@ def test_none_is_taken_that_predicts_no_better_than_no_model(robot: Path, tmp_pa
     given = gather(robot, [train], [other])
     (found,) = compare_methods(given, ["ols"])
     assert found.unseen > 100.0 and not found.chosen
-    assert "add training motion" in caveats(given, [found])[-1]
+    assert "add training motion" in caveats(given, [found])[-1].text
 
 
 def test_one_methods_error_costs_no_other_result(robot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

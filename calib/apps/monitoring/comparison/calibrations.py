@@ -22,7 +22,7 @@ class Calibration:
         robot: the calibrated arm; the nominal one of a description.
         cell: that arm in its cell, with joint corrections.
         free, covariance: of steps along the cell's fitted parameters (`calib.geometry.observation`); empty if nominal.
-        learnt: (m, n) the fitted poses [rad or m]; None if nominal.
+        fitted_joints: (m, n) the fitted poses [rad or m]; None if nominal.
         metrics: of the fit; None if nominal.
         judged: level and reason of its verdict; empty if nominal.
         rows: errors on unseen poses, else on the fitted ones; None if nominal.
@@ -35,7 +35,7 @@ class Calibration:
     cell: Installation
     free: np.ndarray
     covariance: np.ndarray
-    learnt: np.ndarray | None = None
+    fitted_joints: np.ndarray | None = None
     metrics: FitMetrics | None = None
     judged: tuple[str, str] = ("", "")
     rows: ComparedRows | None = None
@@ -105,18 +105,18 @@ def read_fits(before: Place, after: Place) -> tuple[Calibration, Calibration]:
     return earlier, later
 
 
-def read_fit(place: Place) -> Calibration:
+def read_fit(source: Place) -> Calibration:
     """Return the calibration in the folder of a fit or a session."""
-    folder = place.fit
+    folder = source.fit
     assert folder is not None
     metrics = folder.metrics()
     verdict_metrics = metrics
     tolerance_mm = metrics.tolerance_mm
-    if place.session:
+    if source.session:
         # A session's verdict is that of its validation, by the tolerance that its settings state today.
-        tolerance_mm = place.session.settings.fit.tolerance_mm
-        if place.session.validation.judged.exists():
-            verdict_metrics = place.session.validation.metrics()
+        tolerance_mm = source.session.settings.fit.tolerance_mm
+        if source.session.validation.judged.exists():
+            verdict_metrics = source.session.validation.metrics()
     tolerance = None
     if tolerance_mm:
         tolerance = 1e-3 * tolerance_mm
@@ -130,17 +130,17 @@ def read_fit(place: Place) -> Calibration:
     free, covariance = read_covariance(folder.path, cell)
     robot = read_calibrated(folder.path)
     return Calibration(
-        name=place.name,
+        name=source.name,
         robot=robot,
         cell=cell,
         free=free,
         covariance=covariance,
-        learnt=folder.learnt_joints(robot.chain.joints),
+        fitted_joints=folder.learnt_joints(robot.chain.joints),
         metrics=metrics,
         judged=(verdict_metrics.verdict, verdict_metrics.reason),
         rows=rows,
         tolerance=tolerance,
-        serial=place.serial,
+        serial=source.serial,
     )
 
 

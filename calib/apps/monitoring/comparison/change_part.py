@@ -29,7 +29,7 @@ class ChangePart(ABC):
 
     Attributes:
         before, after: the calibrations, with ``name``, ``judged`` and ``serial``.
-        found: the test, and more.
+        change: the test, and more.
         tolerance: of `today`; None without.
     """
 
@@ -41,7 +41,7 @@ class ChangePart(ABC):
 
     before: Any
     after: Any
-    found: Any
+    change: Any
     tolerance: float | None
 
     @property
@@ -82,7 +82,7 @@ class ChangePart(ABC):
     @cached_property
     def verdict(self) -> Verdict:
         """Whether the earlier parameters are still within tolerance."""
-        figures = f"{self.words}, χ² {self.found.chi2:.3g} on {self.found.freedom}"
+        figures = f"{self.words}, χ² {self.change.chi2:.3g} on {self.change.freedom}"
         if self.tolerance:
             state = "not"
             if self.today <= self.tolerance:
@@ -91,7 +91,7 @@ class ChangePart(ABC):
         return Verdict.of(figures, self.noticed)
 
     def _shared_findings(self) -> Iterator[Finding]:
-        change_test: ChangeTest = self.found
+        change_test: ChangeTest = self.change
         names = {"before": self.before.name, "after": self.after.name}
         if change_test.changed and change_test.parameters:
             first = change_test.parameters[0]
@@ -118,7 +118,7 @@ class ChangePart(ABC):
         figure = KeyFigure(self.error_words, "", self.shown(self.today), "", self.basis, allowed, reached)
 
         title = "Changed parameters, those first that explain most"
-        compared = [parameter for parameter in self.found.parameters if parameter.sigma or parameter.explained]
+        compared = [parameter for parameter in self.change.parameters if parameter.sigma or parameter.explained]
         parameters = table(title, _PARAMETERS, compared[:MAX_PARAMETERS], f"All in {self.table}.")
         blocks = [*self.blocks(), parameters]
         blocks.insert(1, Text("Notes", notes_of(self.noticed), "note"))
@@ -131,7 +131,7 @@ class ChangePart(ABC):
 
     def to_dict(self) -> dict[str, object]:
         """Return the numbers as in ``metrics.json`` [SI]."""
-        change_test: ChangeTest = self.found
+        change_test: ChangeTest = self.change
         return {
             "verdict": self.verdict.level,
             "reason": self.verdict.reason,

@@ -147,7 +147,7 @@ def compare(before: Calibration, after: Calibration, settings: DiffSettings) -> 
     chain = before.chain
     fitted_joints = []
     for calibration in (before, after):
-        joints = calibration.learnt
+        joints = calibration.fitted_joints
         if joints is not None:
             stride = max(1, -(-len(joints) // MAX_POSES))
             fitted_joints.append(joints[::stride])
@@ -192,9 +192,9 @@ def corrected_motion(before: Calibration, after: Calibration, settings: DiffSett
         replace(later, chain=after.cell.chain, deflection=after.cell.deflection),
     )
     no_parameter = np.zeros(0, dtype=int)
-    q = after.learnt
+    q = after.fitted_joints
     if q is None:
-        q = before.learnt
+        q = before.fitted_joints
     assert q is not None
     sight = replace(pair, cells=cells, free=no_parameter).see(q)
     return sight.motion("", np.zeros((0, 0))).rms

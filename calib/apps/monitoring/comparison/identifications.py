@@ -103,8 +103,8 @@ def read_models(before: Place, after: Place) -> tuple[Identified, Identified]:
     return earlier, later
 
 
-def _read(place: Place) -> Identified:
-    folder = place.identification
+def _read(source: Place) -> Identified:
+    folder = source.identification
     assert folder is not None
     dynamics = folder.dynamics()
     table = read_model_table(folder.path)
@@ -123,13 +123,13 @@ def _read(place: Place) -> Identified:
     for path in folder.torques:
         states = read_states(path, dynamics.model.n)
         if states:
-            motions[f"{place.name}/{path.name}"] = states
+            motions[f"{source.name}/{path.name}"] = states
     tolerance_percent = 0.0
-    if place.session:
-        tolerance_percent = place.session.settings.dynamics.tolerance_percent
+    if source.session:
+        tolerance_percent = source.session.settings.dynamics.tolerance_percent
     verdict = folder.judged
     return Identified(
-        name=place.name,
+        name=source.name,
         robot=read_calibrated(folder.path),
         dynamics=dynamics,
         names=names,
@@ -141,7 +141,7 @@ def _read(place: Place) -> Identified:
         unit=table.get("unit", TORQUE),
         judged=(verdict.verdict, verdict.reason),
         tolerance=tolerance_percent,
-        serial=place.serial,
+        serial=source.serial,
     )
 
 

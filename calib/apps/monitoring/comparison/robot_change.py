@@ -74,7 +74,7 @@ class RobotChange(ChartedResult, Judged):
     def _change_of(self, kind: str) -> Any:
         for part in self.parts:
             if part.kind == kind:
-                return part.found
+                return part.change
         return None
 
     def section(self) -> Section:
@@ -102,7 +102,7 @@ class RobotChange(ChartedResult, Judged):
             charts: dict[str, Chart] = {}
             if plots:
                 charts = part.charts()
-            parameters = (part.table, ParameterChange._fields, part.found.parameters)
+            parameters = (part.table, ParameterChange._fields, part.change.parameters)
             parts.append(pages.ResultPart(part.section(), charts, part.captions, parameters))
         earlier, later, robot = self._names
         setup = {"earlier": earlier, "later": later}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -37,16 +37,16 @@ class ToolPart(ChangePart):
 
     @property
     def today(self) -> float:
-        return float(np.hypot(self.found.motions[0].rms, self.after.residual_rms))
+        return float(np.hypot(self.change.motions[0].rms, self.after.residual_rms))
 
     @property
     def words(self) -> str:
-        motion = self.found.motions[0]
+        motion = self.change.motions[0]
         return f"the tool moved by {1e3 * motion.rms:.3g} mm rms (σ lets expect {1e3 * motion.expected:.2g} mm)"
 
     @property
     def basis(self) -> str:
-        return f"{len(self.found.motions[0].q)} poses"
+        return f"{len(self.change.motions[0].q)} poses"
 
     def shown(self, value: float) -> str:
         return f"{1e3 * value:.3g} mm"
@@ -54,15 +54,15 @@ class ToolPart(ChangePart):
     def specific_findings(self) -> list[Finding]:
         before = self.before
         after = self.after
-        change = self.found
+        change = self.change
         motion = change.motions[0]
         residual_rms = max(before.residual_rms, after.residual_rms)
         ratio = motion.rms / max(residual_rms, 1e-12)
-        beyond = ratio
+        times_residual = ratio
         result: list[Finding] = []
         if self.tolerance:
             # Whether the change matters is then said by the tolerance.
-            beyond = 0.0
+            times_residual = 0.0
             result.append(finding("outgrown", times=self.today / self.tolerance, today=self.today, after=after.name))
             at_random = change.motions[1]
             significant = np.sqrt(max(at_random.rms**2 - at_random.expected**2, 0.0))
@@ -75,7 +75,7 @@ class ToolPart(ChangePart):
             hidden_by = residual_rms
         sigmas = change.sigmas
         result.append(
-            finding("arm-changed", sigmas=sigmas, beyond=beyond, probability=change.probability, left=hidden_by)
+            finding("arm-changed", sigmas=sigmas, beyond=times_residual, probability=change.probability, left=hidden_by)
         )
 
         same_base = self.settings.same_base
@@ -115,13 +115,13 @@ class ToolPart(ChangePart):
         ]
         return [
             Text("Motion", self._motion()),
-            table("Motion of the tool", motions, self.found.motions),
-            table("Motion of the tool by what describes one joint", by_joint, self.found.by_joint),
+            table("Motion of the tool", motions, self.change.motions),
+            table("Motion of the tool by what describes one joint", by_joint, self.change.by_joint),
         ]
 
     def _motion(self) -> list[str]:
         """Return sentences on the target's motion: how far, where most, and by which joint."""
-        change = self.found
+        change = self.change
         lines = []
         for motion in change.motions:
             beginning = f"{motion.where} ({len(motion.q)}): the tool moved by {_median_mm(motion)} mm (median)"
@@ -144,8 +144,8 @@ class ToolPart(ChangePart):
     def charts(self) -> dict[str, Chart]:
         from calib.toolkit.report_charts import error_map, parameter_changes
 
-        motion = self.found.motions[0]
-        changes = {parameter.name: parameter for parameter in self.found.parameters}
+        motion = self.change.motions[0]
+        changes = {parameter.name: parameter for parameter in self.change.parameters}
         rows = []
         for element in self.before.chain.elements:
             change = changes[element.name]
@@ -158,9 +158,9 @@ class ToolPart(ChangePart):
             charts["parameters"] = parameter_changes(rows, of="later - earlier")
         return charts
 
-    def numbers(self) -> dict[str, Any]:
+    def numbers(self) -> dict[str, object]:
         motions = {}
-        for motion in self.found.motions:
+        for motion in self.change.motions:
             motions[motion.where] = {
                 "poses": len(motion.q),
                 "rms": motion.rms,
@@ -171,7 +171,7 @@ class ToolPart(ChangePart):
                 "turn_median": float(np.median(motion.orientation)),
                 "turn_worst": float(motion.orientation.max()),
             }
-        return {"motions": motions, "by_joint": dict(self.found.by_joint)}
+        return {"motions": motions, "by_joint": dict(self.change.by_joint)}
 
 
 def _median_mm(motion: ToolMotion) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -42,9 +42,9 @@ class TorquePart(ChangePart):
     def judged(self) -> TorqueChange:
         """The motion that `today` rests on: of those measured for the later model the worst."""
         measured = [
-            change for change in self.found.torques if change.unexplained and change.where in self.after.motions
+            change for change in self.change.torques if change.unexplained and change.where in self.after.motions
         ]
-        return max(measured or self.found.torques, key=_unexplained_before)
+        return max(measured or self.change.torques, key=_unexplained_before)
 
     @property
     def today(self) -> float:
@@ -70,17 +70,17 @@ class TorquePart(ChangePart):
         return f"{value:.3g} %"
 
     def specific_findings(self) -> list[Finding]:
-        test = self.found
+        test = self.change
         change = self.judged
         residual = 0.0
         if change.unexplained:
             residual = 1e-2 * min(change.unexplained) * _rms(change.torque)
         ratio = change.rms / max(residual, 1e-12)
-        beyond = ratio
+        times_residual = ratio
         result: list[Finding] = []
         if self.tolerance:
             # Whether the change matters is then said by the tolerance.
-            beyond = 0.0
+            times_residual = 0.0
             times = self.today / self.tolerance
             result.append(finding("model-outgrown", times=times, today=self.today, after=self.after.name))
         hidden_by = None
@@ -90,7 +90,7 @@ class TorquePart(ChangePart):
             finding(
                 "dynamics-changed",
                 sigmas=test.sigmas,
-                beyond=beyond,
+                beyond=times_residual,
                 unit=self.unit,
                 probability=test.probability,
                 left=hidden_by,
@@ -105,7 +105,7 @@ class TorquePart(ChangePart):
     def blocks(self) -> list[Block]:
         unit = self.unit
         rows = []
-        for change in self.found.torques:
+        for change in self.change.torques:
             for j, name in enumerate(self.after.rows):
                 rows.append(
                     _TorqueRow(
@@ -132,9 +132,9 @@ class TorquePart(ChangePart):
             RecordColumn(f"torque if it changed alone, rms {unit}", "{0.rms:.3g}"),
         ]
         return [
-            Text("Torque", [self._words(change) for change in self.found.torques]),
+            Text("Torque", [self._words(change) for change in self.change.torques]),
             table("Change of the torque", torques, rows),
-            table("What one joint's friction or one link's body explains", parts, self.found.parts, most=6),
+            table("What one joint's friction or one link's body explains", parts, self.change.parts, most=6),
         ]
 
     def _words(self, change: TorqueChange) -> str:
@@ -160,16 +160,16 @@ class TorquePart(ChangePart):
         rows_of_panels = -(-len(panels) // 2)
         return {"torque": Chart(panels, 0.7 + 0.95 * rows_of_panels, 2, title=change.where, shared="x")}
 
-    def numbers(self) -> dict[str, Any]:
+    def numbers(self) -> dict[str, object]:
         torques = {}
-        for change in self.found.torques:
+        for change in self.change.torques:
             torques[change.where] = {
                 "rms": change.rms,
                 "expected": _rms(change.expected),
                 "unexplained_percent": change.unexplained,
                 "by_row": [_rms(column) for column in change.change.T],
             }
-        parts = [{"name": part.name, "explained": part.explained, "rms": part.rms} for part in self.found.parts]
+        parts = [{"name": part.name, "explained": part.explained, "rms": part.rms} for part in self.change.parts]
         return {"torques": torques, "parts": parts}
 
 
