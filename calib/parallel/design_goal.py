@@ -56,11 +56,17 @@ class LoadedPlatform(PlatformRegressor):
 
     def torques(self, motion: LoopMotion) -> np.ndarray:
         """Return the actuators' torques (N, loads · n) of a motion, run after run."""
-        runs = (replace(self, loads=(None,), carried=load) for load in self.loads)
-        return np.concatenate([super(LoadedPlatform, run).torques(motion) for run in runs], axis=1)
+        torques = []
+        for load in self.loads:
+            run = replace(self, loads=(None,), carried=load)
+            torques.append(super(LoadedPlatform, run).torques(motion))
+        return np.concatenate(torques, axis=1)
 
     def _columns(self, motion: LoopMotion) -> np.ndarray:
-        runs = [self.model.along(motion, load).transpose(2, 1, 0)[self.columns] for load in self.loads]
+        runs = []
+        for load in self.loads:
+            regressor = self.model.along(motion, load).transpose(2, 1, 0)
+            runs.append(regressor[self.columns])
         return np.concatenate(runs, axis=1).transpose(2, 1, 0)
 
 
@@ -97,11 +103,11 @@ def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") 
     table = read_table(folder)
     unreadable = f"{path} contains no model of a parallel robot ({{}}); give a folder of calib identify"
     with refused_as(RobotError, (ValueError, KeyError, TypeError, AttributeError), unreadable):
-        values_ = {str(name): float(value) for name, value in table["values"].items()}
+        stated_values = {str(name): float(value) for name, value in table["values"].items()}
         drive_sets = []
         passive = ""
         for joint, label in enumerate(tree.labels):
-            drive_set = " ".join(drive for drive in DRIVES if drive + label in values_)
+            drive_set = " ".join(drive for drive in DRIVES if drive + label in stated_values)
             drive_sets.append(drive_set)
             if joint not in tree.actuated:
                 passive = passive or drive_set
@@ -111,10 +117,10 @@ def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") 
         actuated = [drive_sets[joint] for joint in tree.actuated]
         model = make_parallel_model(robot.mechanism, actuated, v0=v0, payloads=payloads, passive=passive)
         model = replace(model, identical_legs=bool(table.get("identical_legs")), preload=preload)
-    missing = [name for name in model.names[: model.inertial] if name not in values_]
+    missing = [name for name in model.names[: model.inertial] if name not in stated_values]
     if missing:
         raise RobotError(f"{path} is of another robot: parameter {missing[0]} is missing")
-    return model, np.array([values_.get(name, 0.0) for name in model.names])
+    return model, np.array([stated_values.get(name, 0.0) for name in model.names])
 
 
 def file_bodies(robot: ParallelMechanism, model: ParallelModel) -> np.ndarray:
@@ -137,19 +143,22 @@ def of_options(
 ) -> tuple[ParallelModel, np.ndarray, Loads, tuple[str, ...]]:
     """Return the model of an identification's options, its values (p,) where known, the loads, and notes."""
     if options is None:
-        return *read_model(robot, None, settings.drives or "Fv Fc off"), loads_of(settings.loads, (), False), ()
+        model, values = read_model(robot, None, settings.drives or "Fv Fc off")
+        return model, values, loads_of(settings.loads, (), False), ()
     if isinstance(options, IdentifySettings):
         identify_options = options_of(options)
     else:
         identify_options = read_options(options)
     refuse_options_of_arms(identify_options.settings, identify_options)
-    settings_ = identify_options.settings
-    row_kind = settings_.torque_rows.name
+    identification_settings = identify_options.settings
+    row_kind = identification_settings.torque_rows.name
     rows = rows_named(robot.mechanism, "" if row_kind == MOTOR.name else row_kind)
-    model = model_of(robot.mechanism, replace(settings_, torque_rows=rows, v0=(SMOOTH,)))
-    payloads, notes = stated_payloads(settings_)
+    smoothed_settings = replace(identification_settings, torque_rows=rows, v0=(SMOOTH,))
+    model = model_of(robot.mechanism, smoothed_settings)
+    payloads, notes = stated_payloads(identification_settings)
     values = np.append(file_bodies(robot, model), np.zeros(len(model.columns)))
-    values[model.inertial - 10 * len(payloads) : model.inertial] = np.ravel(payloads)
+    first_payload = model.inertial - 10 * len(payloads)
+    values[first_payload : model.inertial] = np.ravel(payloads)
     return model, values, loads_of(settings.loads, model.payloads, with_payloads=True), tuple(notes)
 
 
@@ -232,8 +241,10 @@ def foretold(excitation: Any, states: int = 400) -> Any:
     x = rng.uniform(robot.lower, robot.upper, (states, robot.r))
     still = loop_jacobians(mechanism, mechanism.home).readings[0]
     bounds = inputs.limits.bounds
-    fast = 0.5 * np.min(bounds.velocity / np.linalg.norm(still, axis=1)) * np.ones(robot.r)
-    v, a = fast * (2.0 * rng.random((2, states, robot.r)) - 1.0) * [[[1.0]], [[DEFAULT_RISE]]]
+    largest_rate = np.min(bounds.velocity / np.linalg.norm(still, axis=1))
+    fast = 0.5 * largest_rate * np.ones(robot.r)
+    directions = 2.0 * rng.random((2, states, robot.r)) - 1.0
+    v, a = fast * directions * [[[1.0]], [[DEFAULT_RISE]]]
     W = model_rows(plan, plan.motion(x, v, a))
 
     def torque_sigma(root: np.ndarray) -> np.ndarray:
@@ -258,8 +269,10 @@ def foretold(excitation: Any, states: int = 400) -> Any:
 
 def model_rows(plan: LoadedPlatform, motion: LoopMotion) -> np.ndarray:
     """Return the regressor (N, n, b) of the actuators' torques, redundant ones of least norm, with all payloads."""
-    W = plan.model.platform_regressor(motion).transpose(2, 1, 0)[plan.columns].transpose(2, 1, 0)
-    return np.linalg.pinv(motion.jacobians.readings).transpose(0, 2, 1) @ W
+    regressor = plan.model.platform_regressor(motion).transpose(2, 1, 0)
+    W = regressor[plan.columns].transpose(2, 1, 0)
+    distribution = np.linalg.pinv(motion.jacobians.readings)
+    return distribution.transpose(0, 2, 1) @ W
 
 
 def _inverse(information: np.ndarray) -> np.ndarray:
@@ -273,5 +286,7 @@ def whole(model: ParallelModel, values: np.ndarray) -> Purpose:
     base = bases.find(ParallelModel(mechanism, model.terms, rows_named(mechanism), ()))
     columns = np.array([model.names.index(base.standard[k]) for k in base.kept])
     plan: Any = PlatformRegressor(model, columns, values)
-    sigmas = np.linalg.norm(loop_jacobians(mechanism, mechanism.home).readings[0], axis=0)
-    return Purpose(ExcitedModel(plan, plan, None, None, False), IdentifiableColumns(None, sigmas, base.names))
+    home_readings = loop_jacobians(mechanism, mechanism.home).readings[0]
+    sigmas = np.linalg.norm(home_readings, axis=0)
+    excited = ExcitedModel(plan, plan, None, None, False)
+    return Purpose(excited, IdentifiableColumns(None, sigmas, base.names))

@@ -164,7 +164,11 @@ class OpenedRobot:
         """Return the text of ``robot.urdf``."""
         root = ET.Element("robot", name=self.mechanism.robot.name)
         for chain in self.chains:
-            root.extend([*ET.fromstring(write_new(chain))][1 if len(root) else 0 :])
+            elements = list(ET.fromstring(write_new(chain)))
+            # the link that all legs begin at stands in the tree once
+            if len(root):
+                elements = elements[1:]
+            root.extend(elements)
         link = ET.SubElement(root, "link", name=PLATFORM)
         if self.rigid:
             first_leg = self.rigid[0]
@@ -197,9 +201,11 @@ class OpenedRobot:
             pairs.append([f"{leg.name}_end", f"{leg.name}_attachment"])
             types.append("6d" if leg.end == "rigid" else "3d")
         table = {"closed_loop": pairs, "type": types, "name_mot": self.actuated, "joint_name": [], "joint_type": []}
-        lines = [f"{key}: {json.dumps(value)}" for key, value in table.items()]
-        lines += ["home:", *(f"  {json.dumps(name)}: {value:.12f}" for name, value in self.home.items())]
-        return "\n".join(["# Loops of robot.urdf: pairs of links that coincide; values at home [rad or m]", *lines, ""])
+        lines = ["# Loops of robot.urdf: pairs of links that coincide; values at home [rad or m]"]
+        lines += [f"{key}: {json.dumps(value)}" for key, value in table.items()]
+        lines.append("home:")
+        lines += [f"  {json.dumps(name)}: {value:.12f}" for name, value in self.home.items()]
+        return "\n".join([*lines, ""])
 
     def mjcf(self) -> str:
         """Return the text of ``robot.xml``."""
@@ -369,13 +375,13 @@ def _calibrated(robot: ParallelMechanism, folder: Path) -> _Source:
     chain, arm = _side_by_side(model, bodies)
     prior_bodies = next(find_prior_bodies(chain, arm))
     estimate = read_estimate(folder)
-    covariance = read_covariance(folder / COVARIANCE)[1]
-    table: dict[str, object] = {
-        "names": [row.name for row in estimate],
-        "units": [row.unit for row in estimate],
-        "values": [row.value for row in estimate],
-        "covariance": covariance,
-    }
+    _, covariance = read_covariance(folder / COVARIANCE)
+    names, units, values = [], [], []
+    for row in estimate:
+        names.append(row.name)
+        units.append(row.unit)
+        values.append(row.value)
+    table: dict[str, object] = {"names": names, "units": units, "values": values, "covariance": covariance}
     drives = drive_table(Dynamics(arm, np.zeros(model.p)))
     notes = ("masses are those of the robot's file, not identified; no friction", *prior_bodies.notes)
     opened = OpenedRobot(model, prior_bodies.parameters.ravel(), drives)
@@ -450,12 +456,16 @@ def _check(opened: OpenedRobot, text: str, where: str, postures: int = 5) -> Non
     rng = np.random.default_rng(0)
     r = opened.mechanism.robot.r
     mjcf = where.endswith(".xml")
-    posture = mechanism.place(0.9 * rng.uniform(mechanism.robot.lower, mechanism.robot.upper, (postures, r)))
-    motion = of_platform(mechanism, posture, *rng.uniform(-1.0, 1.0, (2, postures, r)))
-    rigid = np.concatenate([opened.values[: opened.model.inertial], np.zeros(len(opened.model.terms))])
+    coordinates = rng.uniform(mechanism.robot.lower, mechanism.robot.upper, (postures, r))
+    posture = mechanism.place(0.9 * coordinates)
+    rate, change = rng.uniform(-1.0, 1.0, (2, postures, r))
+    motion = of_platform(mechanism, posture, rate, change)
+    inertial = opened.values[: opened.model.inertial]
+    rigid = np.concatenate([inertial, np.zeros(len(opened.model.terms))])
     expected = opened.model.platform_force(rigid, motion, ())
     if mjcf:
-        expected += np.einsum("ntr,nt->nr", motion.jacobians.joints, opened.drives.values[:, 0] * motion.a)
+        motor_torques = opened.drives.values[:, 0] * motion.a
+        expected += np.einsum("ntr,nt->nr", motion.jacobians.joints, motor_torques)
     forces = np.zeros_like(expected)
     gap_size = 0.0
     if mjcf:

@@ -100,9 +100,10 @@ def drive_gains(
     pseudo_values = []
     blocks = np.flatnonzero(data.rows.reshape(-1, len(squares)).any(axis=1)).tolist()
     for block in blocks:
+        without_block = [k for k in blocks if k != block]
         # without the only run that carries the payload
         with suppress(NotConverged, Unidentifiable):
-            pseudo_values.append(_total_least_squares(data, squares, rows, [k for k in blocks if k != block]).gains)
+            pseudo_values.append(_total_least_squares(data, squares, rows, without_block).gains)
     jackknife = np.sqrt((len(pseudo_values) - 1) * np.var(pseudo_values, axis=0))
     wider = np.maximum(1.0, jackknife / np.sqrt(np.diag(solution.covariance)))
     values = np.zeros(len(names))
@@ -167,7 +168,8 @@ def _total_least_squares(
         raise Unidentifiable("these runs do not identify the drive gains: record richer motion", data.names[:n])
     inverse = np.linalg.pinv(flat) / size[:-1, None]
     variance = float(weighted @ weighted) / max((data.rows / tau).sum() - len(x), 1.0)
-    squared = np.sum(residual**2 / scatter[:, None]) / max(data.rows.sum() - len(x), 1)
+    weighted_square = np.sum(residual**2 / scatter[:, None])
+    squared = weighted_square / max(data.rows.sum() - len(x), 1)
     gains = x[:n] / size[:n]
     covariance = variance * (inverse @ inverse.T)[:n, :n]
     return _Solution(gains, covariance, x[n:] / size[n:-1], float(squared))

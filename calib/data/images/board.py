@@ -16,6 +16,7 @@ Squares are counted, not inner corners::
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Annotated
 
@@ -25,7 +26,6 @@ from calib import files
 from calib.config import parse, read_toml, strict
 from calib.config_types import OneOf, Real, Whole
 from calib.data.poses import BOARD
-from calib.errors import require
 
 KINDS = ("charuco", "chessboard", "apriltag")
 DICTIONARIES = {f"{bits}x{bits}_{count}": count for bits in (4, 5, 6, 7) for count in (50, 100, 250, 1000)} | {
@@ -35,7 +35,8 @@ DICTIONARIES = {f"{bits}x{bits}_{count}": count for bits in (4, 5, 6, 7) for cou
     "apriltag_36h11": 587,
 }
 """Number of markers in each dictionary."""
-MIN_CORNERS = 8  # corners that make an image useful
+# corners that make an image useful
+MIN_CORNERS = 8
 
 
 @strict
@@ -60,11 +61,13 @@ class Board:
                 f"marker = {self.marker:g}: the {quantity} must be between {min_share:g} and {max_share:g} of "
                 f"square = {self.square:g}"
             )
-        message = f"{self.columns} x {self.rows} squares look the same upside down: take an even and an odd number"
-        require(self.kind != "chessboard" or (self.columns + self.rows) % 2 == 1, message, ValueError)
+        if self.kind == "chessboard" and (self.columns + self.rows) % 2 == 0:
+            squares = f"{self.columns} x {self.rows} squares"
+            raise ValueError(f"{squares} look the same upside down: take an even and an odd number")
         if self.kind == "chessboard" and min(self.columns, self.rows) < 4:
             raise ValueError("a chessboard needs at least 4 squares in each direction")
-        if self.tags > (count := DICTIONARIES.get(self.dictionary, self.tags)):
+        count = DICTIONARIES.get(self.dictionary, self.tags)
+        if self.tags > count:
             raise ValueError(f"{self.tags} markers are needed, the dictionary {self.dictionary} has {count}")
 
     @property
@@ -92,9 +95,12 @@ def corners(board: Board) -> np.ndarray:
     """Return the positions (K, 3) [m] of a board's corners in the board's frame."""
     if board.kind == "apriltag":
         pitch, side = board.square + board.marker, board.square
-        first = [(column * pitch, row * pitch) for row in range(board.rows) for column in range(board.columns)]
-        tag_corners = [(0.0, 0.0), (side, 0.0), (side, side), (0.0, side)]
-        return np.array([(x + a, y + b, 0.0) for x, y in first for a, b in tag_corners])
+        positions = []
+        for row, column in product(range(board.rows), range(board.columns)):
+            x, y = column * pitch, row * pitch
+            for shift_x, shift_y in ((0.0, 0.0), (side, 0.0), (side, side), (0.0, side)):
+                positions.append((x + shift_x, y + shift_y, 0.0))
+        return np.array(positions)
     across, down = np.meshgrid(np.arange(1, board.columns), np.arange(1, board.rows))
     return board.square * np.column_stack([across.ravel(), down.ravel(), np.zeros(across.size)])
 

@@ -1,6 +1,7 @@
 """Boards to print: SVG and PDF at true scale with a ruler, and their raster for a rendered camera."""
 
 from contextlib import suppress
+from itertools import product
 from pathlib import Path
 
 import cv2
@@ -34,15 +35,18 @@ def dictionary(name: str) -> cv2.aruco.Dictionary:
 
 def _black(board: Board) -> np.ndarray:
     """Return the black rectangles (N, 4) of a board: x, y, width, height [m] in its frame."""
-    side, rectangles = board.square, []
-    fields = [(r, c) for r in range(board.rows) for c in range(board.columns)]
-    if board.kind == "apriltag":
-        pitch = side + board.marker
-        markers = [(c * pitch, r * pitch, side) for r, c in fields]
-    else:
-        rectangles = [np.array([[c * side, r * side, side, side]]) for r, c in fields if (r + c) % 2 == 0]
-        margin, white = 0.5 * (side - board.marker), [field for field in fields if sum(field) % 2 == 1]
-        markers = [(c * side + margin, r * side + margin, board.marker) for r, c in white if board.kind == "charuco"]
+    side = board.square
+    pitch = side + board.marker
+    margin = 0.5 * (side - board.marker)
+    rectangles = []
+    markers = []
+    for row, column in product(range(board.rows), range(board.columns)):
+        if board.kind == "apriltag":
+            markers.append((column * pitch, row * pitch, side))
+        elif (row + column) % 2 == 0:
+            rectangles.append(np.array([[column * side, row * side, side, side]]))
+        elif board.kind == "charuco":
+            markers.append((column * side + margin, row * side + margin, board.marker))
     marker_dictionary = dictionary(board.dictionary)
     for number, (x, y, size) in enumerate(markers):
         bits = cv2.aruco.generateImageMarker(marker_dictionary, number, marker_dictionary.markerSize + 2, borderBits=1)
@@ -67,14 +71,19 @@ def raster(board: Board, pixels_per_metre: float, margin: float) -> np.ndarray:
     """
     width, height = (round((length + 2.0 * margin) * pixels_per_metre) for length in board.extent)
     image = np.ones((height, width), dtype=np.float32)
+
+    def black_shares(first: float, length: float, count: int) -> tuple[slice, np.ndarray]:
+        """Return the pixels that an interval [m] touches, and the share of each that it covers."""
+        low = (first + margin) * pixels_per_metre
+        high = (first + length + margin) * pixels_per_metre
+        cells = np.arange(int(np.floor(low)), min(int(np.ceil(high)), count))
+        covered = np.minimum(cells + 1, high) - np.maximum(cells, low)
+        return slice(cells[0], cells[-1] + 1), np.clip(covered, 0.0, 1.0)
+
     for x, y, w, h in _black(board):
-        shares = []
-        for first, length, count in ((y, h, height), (x, w, width)):
-            low, high = ((edge + margin) * pixels_per_metre for edge in (first, first + length))
-            cells = np.arange(int(np.floor(low)), min(int(np.ceil(high)), count))
-            shares.append((cells, np.clip(np.minimum(cells + 1, high) - np.maximum(cells, low), 0.0, 1.0)))
-        (rows, down), (columns, across) = shares
-        image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1] -= np.outer(down, across).astype(np.float32)
+        rows, down = black_shares(y, h, height)
+        columns, across = black_shares(x, w, width)
+        image[rows, columns] -= np.outer(down, across).astype(np.float32)
     return np.clip(image, 0.0, 1.0)
 
 
@@ -86,29 +95,30 @@ def page_size(board: Board, paper: str = "") -> tuple[float, float]:
     """
     needed = board.extent[0] + 2 * EDGE, board.extent[1] + 2 * EDGE + RULER
     papers = [PAPERS[paper]] if paper else list(PAPERS.values())
-    sizes = [size for short, long in papers for size in ((short, long), (long, short))]
-    shares = [min(size[0] / needed[0], size[1] / needed[1]) for size in sizes]
-    if fitting := [size for size, share in zip(sizes, shares) if share >= 1.0]:
-        return fitting[0]
+    largest_share = 0.0
+    for short, long in papers:
+        for width, height in ((short, long), (long, short)):
+            share = min(width / needed[0], height / needed[1])
+            if share >= 1.0:
+                return width, height
+            largest_share = max(largest_share, share)
     if not paper:
         return needed
     raise UsageError(
         f"the board takes {1e3 * needed[0]:.0f} x {1e3 * needed[1]:.0f} mm with margins and ruler, larger than "
-        f"{paper.upper()}; squares of {int(1e3 * board.square * max(shares) * 0.97)} mm would fit"
+        f"{paper.upper()}; squares of {int(1e3 * board.square * largest_share * 0.97)} mm would fit"
     )
 
 
 def svg(board: Board, size: tuple[float, float]) -> str:
     """Return the page as SVG, in millimetres."""
     boxes, texts = _page(board, size)
-    body = [
-        f'<rect x="{1e3 * x:.4f}" y="{1e3 * y:.4f}" width="{1e3 * w:.4f}" height="{1e3 * h:.4f}"/>'
-        for x, y, w, h in boxes
-    ]
-    body += [
-        f'<text x="{1e3 * x:.2f}" y="{1e3 * y:.2f}" font-size="2.8" font-family="Helvetica, Arial">{text}</text>'
-        for x, y, text in texts
-    ]
+    body = []
+    for x, y, w, h in 1e3 * boxes:
+        body.append(f'<rect x="{x:.4f}" y="{y:.4f}" width="{w:.4f}" height="{h:.4f}"/>')
+    for x, y, text in texts:
+        position = f'x="{1e3 * x:.2f}" y="{1e3 * y:.2f}"'
+        body.append(f'<text {position} font-size="2.8" font-family="Helvetica, Arial">{text}</text>')
     width, height = (f"{1e3 * length:g}" for length in size)
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}mm" height="{height}mm" viewBox="0 0 {width} {height}" '
@@ -122,9 +132,10 @@ def pdf(board: Board, size: tuple[float, float]) -> bytes:
     """Return the page as a PDF at true scale, with print scaling switched off."""
     boxes, texts = _page(board, size)
     width, height = (length / POINT for length in size)
-    lines = [
-        f"{x / POINT:.4f} {height - (y + h) / POINT:.4f} {w / POINT:.4f} {h / POINT:.4f} re" for x, y, w, h in boxes
-    ]
+    lines = []
+    for x, y, w, h in boxes:
+        bottom = height - (y + h) / POINT
+        lines.append(f"{x / POINT:.4f} {bottom:.4f} {w / POINT:.4f} {h / POINT:.4f} re")
     lines.append("f")
     for x, y, text in texts:
         escaped = text.replace("\\", r"\\").replace("(", r"\(").replace(")", r"\)")
@@ -156,8 +167,13 @@ def _page(board: Board, size: tuple[float, float]) -> tuple[np.ndarray, list[tup
     base, line_width = size[1] - EDGE - 0.006, 0.0002
     ticks = [[left_edge - line_width / 2, base, length + line_width, line_width]]
     for millimetre in range(round(1e3 * length) + 1):
-        tick_height = 0.004 if millimetre % 10 == 0 else 0.003 if millimetre % 5 == 0 else 0.002
-        ticks.append([left_edge + 1e-3 * millimetre - line_width / 2, base - tick_height, line_width, tick_height])
+        tick_height = 0.002
+        if millimetre % 10 == 0:
+            tick_height = 0.004
+        elif millimetre % 5 == 0:
+            tick_height = 0.003
+        tick_edge = left_edge + 1e-3 * millimetre - line_width / 2
+        ticks.append([tick_edge, base - tick_height, line_width, tick_height])
     advice = f"{board.words}, {board.dictionary}: print at 100 %, measure, put it into board.toml"
     texts = [
         (left_edge, base + 0.0035, "0"),

@@ -5,26 +5,34 @@ import numpy as np
 from calib.data.images.pixels import Pixels
 from calib.data.poses import IN_HAND
 
-GRID = (12, 9)  # cells of the image that coverage counts (our choice)
+# cells of the image that coverage counts (our choice)
+GRID = (12, 9)
 
 
 def image_words(block: Pixels) -> str:
     """Return a summary sentence of newly read images: corners, mounting, lens, coverage."""
-    lens = block.lens
-    focal = "" if lens is None else f", focal length {lens.values[0]:.0f} px {'given' if block.known else 'found'}"
     corner_counts = f"{block.seen.sum(axis=1).mean():.1f} of {block.seen.shape[1]} corners each"
-    carried = "the arm carries the camera" if block.mounting == IN_HAND else "the arm carries the board"
+    carried = "the arm carries the board"
+    if block.mounting == IN_HAND:
+        carried = "the arm carries the camera"
+    focal = ""
+    if block.lens is not None:
+        origin = "given" if block.known else "found"
+        focal = f", focal length {block.lens.values[0]:.0f} px {origin}"
     return f"{corner_counts}; {carried}{focal}; {coverage_words(block.pixel[block.seen], block.size)}"
 
 
 def coverage(pixels: np.ndarray, size: tuple[int, int], weights: np.ndarray | None = None) -> np.ndarray:
     """Return the number (or total weight) of corners in each cell of the image grid (`GRID`), as (rows, columns)."""
     bins = [np.linspace(0, length, count + 1) for length, count in zip(size, GRID)]
-    return np.histogram2d(pixels[:, 0], pixels[:, 1], bins, weights=weights)[0].T
+    counts, _, _ = np.histogram2d(pixels[:, 0], pixels[:, 1], bins, weights=weights)
+    return counts.T
 
 
 def coverage_words(pixels: np.ndarray, size: tuple[int, int]) -> str:
     """Return a sentence on the share of the image covered by corners, with advice if it is small."""
     share = float(np.mean(coverage(pixels, size) > 0))
-    few = "; the lens is not identifiable in the rest: bring the board closer and into the image's corners"
-    return f"corners lie in {share:.0%} of the image{few if share < 0.6 else ''}"
+    sentence = f"corners lie in {share:.0%} of the image"
+    if share < 0.6:
+        sentence += "; the lens is not identifiable in the rest: bring the board closer and into the image's corners"
+    return sentence

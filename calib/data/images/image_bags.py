@@ -29,6 +29,26 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/Image", "sensor_msgs/CompressedImage")
+# type and number of the values of a pixel, by the message's encoding
+ENCODINGS: dict[str, tuple[type[np.generic], int]] = {
+    "mono8": (np.uint8, 1),
+    "8UC1": (np.uint8, 1),
+    "mono16": (np.uint16, 1),
+    "16UC1": (np.uint16, 1),
+    "bgr8": (np.uint8, 3),
+    "rgb8": (np.uint8, 3),
+    "8UC3": (np.uint8, 3),
+    "bgra8": (np.uint8, 4),
+    "rgba8": (np.uint8, 4),
+}
+# an image further from the nearest joint state has none [s]
+MAX_DELAY = 0.1
+# of a joint about an image [rad/s or m/s]; our choice
+MAX_JOINT_SPEED = 2e-3
+# joints of one stop differ by less [rad or m]
+MAX_STOP_DISTANCE = 1e-3
+# images of one stop that are kept
+MAX_PER_STOP = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +104,11 @@ def read_image_bag(
 
 
 def _image_stamps(reader: AnyReader, connections: list[Connection]) -> np.ndarray:
-    messages = reader.messages(connections=connections)
-    return np.array([header_stamp(reader.deserialize(raw, c.msgtype)) or logged for c, logged, raw in messages])
+    stamps = []
+    for connection, logged, raw in reader.messages(connections=connections):
+        message = reader.deserialize(raw, connection.msgtype)
+        stamps.append(header_stamp(message) or logged)
+    return np.array(stamps)
 
 
 def _images(reader: AnyReader, connections: list[Connection], numbers: set[int]) -> Iterator[np.ndarray]:
@@ -100,21 +123,21 @@ def _grey(message: Any) -> np.ndarray:
 
     if hasattr(message, "format"):
         return decode(bytes(message.data))
-    kinds = {"mono8": (np.uint8, 1), "8UC1": (np.uint8, 1), "mono16": (np.uint16, 1), "16UC1": (np.uint16, 1)}
-    kinds |= {name: (np.uint8, 3) for name in ("bgr8", "rgb8", "8UC3")} | {
-        "bgra8": (np.uint8, 4),
-        "rgba8": (np.uint8, 4),
-    }
-    if message.encoding not in kinds:
-        raise ValueError(f"images of encoding '{message.encoding}'; known are {', '.join(kinds)}")
-    kind, depth = kinds[message.encoding]
+    if message.encoding not in ENCODINGS:
+        raise ValueError(f"images of encoding '{message.encoding}'; known are {', '.join(ENCODINGS)}")
+    kind, depth = ENCODINGS[message.encoding]
     order = ">" if message.is_bigendian else "<"
-    rows = np.frombuffer(bytes(message.data), np.uint8).reshape(message.height, message.step)
-    flat = np.ascontiguousarray(rows[:, : message.width * depth * np.dtype(kind).itemsize])
-    values = flat.view(np.dtype(kind).newbyteorder(order)).astype(kind).reshape(message.height, message.width, depth)
+    height, width = message.height, message.width
+    rows = np.frombuffer(bytes(message.data), np.uint8).reshape(height, message.step)
+    # rows may be padded
+    flat = np.ascontiguousarray(rows[:, : width * depth * np.dtype(kind).itemsize])
+    stored = flat.view(np.dtype(kind).newbyteorder(order))
+    values = stored.astype(kind).reshape(height, width, depth)
+    if depth == 1:
+        return to_grey(values[:, :, 0])
     if message.encoding.startswith("rgb"):
         values = values[:, :, 2::-1]
-    return to_grey(values[:, :, 0] if depth == 1 else values)
+    return to_grey(values)
 
 
 def _at_rest(images: np.ndarray, stamps: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
@@ -125,36 +148,38 @@ def _at_rest(images: np.ndarray, stamps: np.ndarray, q: np.ndarray) -> tuple[np.
     gap = np.maximum(stamps[after] - stamps[before], 1)
     share = np.clip((images - stamps[before]) / gap, 0.0, 1.0)[:, None]
     q_images = q[before] * (1.0 - share) + q[after] * share
-    max_delay = 0.1  # an image further from the nearest joint state has none [s]
-    has_state = np.minimum(np.abs(images - stamps[before]), np.abs(images - stamps[after])) < max_delay * 1e9
+    delay = np.minimum(np.abs(images - stamps[before]), np.abs(images - stamps[after]))
+    has_state = delay < MAX_DELAY * 1e9
     speed = np.abs(q[after] - q[before]).max(axis=1) / (gap * 1e-9)
-    max_joint_speed = 2e-3  # of a joint about an image [rad/s or m/s]; our choice
-    still = speed < max_joint_speed
+    still = speed < MAX_JOINT_SPEED
+    at_rest = np.flatnonzero(has_state & still)
     if not has_state.all():
+        count = int((~has_state).sum())
+        notes.append(f"{count} images have no joint state within {MAX_DELAY:g} s (do the clocks agree?)")
+    moving = int((has_state & ~still).sum())
+    if moving:
         notes.append(
-            f"{int((~has_state).sum())} images have no joint state within {max_delay:g} s (do the clocks agree?)"
+            f"{moving} images were taken while the arm moved (faster than {1e3 * MAX_JOINT_SPEED:g} mrad/s): left out"
         )
-    if moving := int((has_state & ~still).sum()):
-        notes.append(
-            f"{moving} images were taken while the arm moved (faster than {1e3 * max_joint_speed:g} mrad/s): left out"
-        )
-    selected, stop = [], 0
-    max_apart = 1e-3  # joints of one stop differ by less [rad or m]
-    max_per_stop = 3  # images of one stop that are kept
-    for k in np.flatnonzero(has_state & still):
-        stop = stop + 1 if selected and np.abs(q_images[k] - q_images[selected[-1]]).max() < max_apart else 1
-        if stop <= max_per_stop:
+    selected = []
+    images_of_stop = 0
+    for k in at_rest:
+        same_stop = bool(selected) and np.abs(q_images[k] - q_images[selected[-1]]).max() < MAX_STOP_DISTANCE
+        images_of_stop = images_of_stop + 1 if same_stop else 1
+        if images_of_stop <= MAX_PER_STOP:
             selected.append(int(k))
-    if surplus := int((has_state & still).sum()) - len(selected):
-        notes.append(f"{surplus} more images of the same stops were left out ({max_per_stop} of each are kept)")
+    surplus = len(at_rest) - len(selected)
+    if surplus:
+        notes.append(f"{surplus} more images of the same stops were left out ({MAX_PER_STOP} of each are kept)")
     return np.array(selected, dtype=int), q_images[selected], notes
 
 
 def write_image_folder(bag: ImageBag, board: Board, folder: Path) -> Path:
     """Write a bag's images as a folder for `calib.data.images.image_folders`."""
     write_board(board, folder / BOARD)
+    header = ["image", *(f"{name} [rad]" for name in bag.joint_names)]
     rows = [[name, *map(float, joints)] for name, joints in zip(bag.names, bag.q)]
-    files.write_table(folder / JOINTS, ["image", *(f"{name} [rad]" for name in bag.joint_names)], rows)
+    files.write_table(folder / JOINTS, header, rows)
     write_corners(folder / CORNERS, bag.corners)
     return folder
 

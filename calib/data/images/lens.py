@@ -23,13 +23,23 @@ import numpy as np
 
 from calib import files
 from calib.config_types import shown
-from calib.errors import CalibError, MeasurementError, refused_as, require, suggestion
+from calib.errors import CalibError, MeasurementError, refused_as, suggestion
 from calib.records import frozen
 
+# of a lens's values
 NAMES = {
     "pinhole": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
+# number of values that a lens of a model may have
+COUNTS = {"pinhole": (9, 12), "fisheye": (8,)}
+# of the inverse; Newton's, so that a handful does
+ITERATIONS = 20
+LENS = "camera.yaml"
+# distortion models of camera_info, and the models here
+MODELS = {"plumb_bob": "pinhole", "rational_polynomial": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
+# number of coefficients that a distortion model may have, the usual one last; 4 for the others
+COEFFICIENTS = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +58,7 @@ class Lens:
 
     def __post_init__(self) -> None:
         values = frozen(self.values)
-        if self.model not in NAMES or len(values) not in {"pinhole": (9, 12), "fisheye": (8,)}[self.model]:
+        if self.model not in NAMES or len(values) not in COUNTS[self.model]:
             raise CalibError(f"no camera model '{self.model}' with {len(values)} values; known: pinhole, fisheye")
         if not np.isfinite(values).all() or min(values[:2]) <= 0.0:
             raise CalibError(f"camera: focal lengths {values[0]:g}, {values[1]:g} px are impossible")
@@ -70,11 +80,16 @@ class Lens:
         """
         ahead = points[:, 2] > 1e-6
         safe = np.where(ahead[:, None], points, [0.0, 0.0, 1.0])
-        pixel, size = self.project(safe), np.array(self.size)
-        in_image = np.all((pixel >= margin) & (pixel <= size - 1 - margin), axis=1)
+        pixel = self.project(safe)
+        largest = np.array(self.size) - 1 - margin
+        in_image = np.all((pixel >= margin) & (pixel <= largest), axis=1)
+        # the ray of its pixel has to be its own
+        centre = self.values[2:4]
+        ray = rays(self, np.where(in_image[:, None], pixel, centre))
         plane = safe[:, :2] / safe[:, 2:]
-        back = rays(self, np.where(in_image[:, None], pixel, self.values[2:4]))
-        return ahead & in_image & (np.abs(back - plane).max(axis=1) < 1e-6 * (1.0 + np.abs(plane).max(axis=1)))
+        error = np.abs(ray - plane).max(axis=1)
+        size = np.abs(plane).max(axis=1)
+        return ahead & in_image & (error < 1e-6 * (1.0 + size))
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Return pixels (N, 2) of points (N, 3) [m] in the camera's frame."""
@@ -82,17 +97,19 @@ class Lens:
 
     def project_with_slopes(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return pixels (N, 2), ∂pixel/∂point (N, 2, 3) [px/m] and ∂pixel/∂values (N, 2, k)."""
-        depth, focal = points[:, 2], self.values[:2]
+        depth = points[:, 2]
+        focal, centre = self.values[:2], self.values[2:4]
         plane = points[:, :2] / depth[:, None]
         bent, across, by_value = BEND[self.model](plane, self.values[4:])
         by_point = np.empty((len(points), 2, 3))
         by_point[:, :, :2] = across / depth[:, None, None]
         by_point[:, :, 2] = -np.einsum("nij,nj->ni", across, plane) / depth[:, None]
-        result = np.zeros((len(points), 2, len(self.values)))
-        result[:, 0, 0], result[:, 1, 1] = bent[:, 0], bent[:, 1]
-        result[:, 0, 2] = result[:, 1, 3] = 1.0
-        result[:, :, 4:] = by_value * focal[:, None]
-        return bent * focal + self.values[2:4], by_point * focal[:, None], result
+        by_lens = np.zeros((len(points), 2, len(self.values)))
+        by_lens[:, 0, 0] = bent[:, 0]
+        by_lens[:, 1, 1] = bent[:, 1]
+        by_lens[:, 0, 2] = by_lens[:, 1, 3] = 1.0
+        by_lens[:, :, 4:] = by_value * focal[:, None]
+        return bent * focal + centre, by_point * focal[:, None], by_lens
 
 
 def _brown_conrady(plane: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -104,20 +121,25 @@ def _brown_conrady(plane: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.nda
     above = 1.0 + square * (k1 + square * (k2 + square * k3))
     below = 1.0 + square * (k4 + square * (k5 + square * k6))
     scale = above / below
-    tangent = np.stack([2 * p1 * a * b + p2 * (square + 2 * a * a), p1 * (square + 2 * b * b) + 2 * p2 * a * b], axis=1)
-    bent = plane * scale[:, None] + tangent
+    tangent_x = 2 * p1 * a * b + p2 * (square + 2 * a * a)
+    tangent_y = p1 * (square + 2 * b * b) + 2 * p2 * a * b
+    bent = plane * scale[:, None] + np.stack([tangent_x, tangent_y], axis=1)
+
+    # derivative of the scale by the square of the radius
     steep = (k1 + square * (2 * k2 + 3 * k3 * square)) / below
     steep -= scale * (k4 + square * (2 * k5 + 3 * k6 * square)) / below
     across = np.empty((len(plane), 2, 2))
     across[:, 0, 0] = scale + 2 * a * a * steep + 2 * p1 * b + 6 * p2 * a
     across[:, 1, 1] = scale + 2 * b * b * steep + 6 * p1 * b + 2 * p2 * a
-    across[:, 0, 1] = across[:, 1, 0] = 2 * a * b * steep + 2 * p1 * a + 2 * p2 * b
-    columns = [square / below, square**2 / below, None, None, square**3 / below]
-    columns += [-scale * square**power / below for power in (1, 2, 3)][: len(k) - 5]
+    mixed = 2 * a * b * steep + 2 * p1 * a + 2 * p2 * b
+    across[:, 0, 1] = mixed
+    across[:, 1, 0] = mixed
+
     by_value = np.empty((len(plane), 2, len(k)))
-    for index, column in enumerate(columns):
-        if column is not None:
-            by_value[:, :, index] = plane * column[:, None]
+    for index, power in ((0, 1), (1, 2), (4, 3)):
+        by_value[:, :, index] = plane * (square**power / below)[:, None]
+    for index, power in zip(range(5, len(k)), (1, 2, 3)):
+        by_value[:, :, index] = plane * (-scale * square**power / below)[:, None]
     by_value[:, :, 2] = np.stack([2 * a * b, square + 2 * b * b], axis=1)
     by_value[:, :, 3] = np.stack([square + 2 * a * a, 2 * a * b], axis=1)
     return bent, across, by_value
@@ -128,13 +150,16 @@ def _fisheye(plane: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
     r = np.maximum(np.linalg.norm(plane, axis=1), 1e-12)
     angle = np.arctan(r)
     powers = angle[:, None] ** np.array([2, 4, 6, 8])
-    long = angle * (1.0 + powers @ k)
-    scale = long / r
+    length = angle * (1.0 + powers @ k)
+    scale = length / r
     bent = plane * scale[:, None]
-    steep = (1.0 + (powers * np.array([3, 5, 7, 9])) @ k) / (1.0 + r * r)  # d long / d r
+    # derivative of the length by r
+    steep = (1.0 + (powers * np.array([3, 5, 7, 9])) @ k) / (1.0 + r * r)
     unit = plane / r[:, None]
-    across = scale[:, None, None] * np.eye(2) + (steep - scale)[:, None, None] * unit[:, :, None] * unit[:, None, :]
-    return bent, across, unit[:, :, None] * (angle[:, None] * powers)[:, None, :]
+    along = (steep - scale)[:, None, None] * unit[:, :, None] * unit[:, None, :]
+    across = scale[:, None, None] * np.eye(2) + along
+    by_value = unit[:, :, None] * (angle[:, None] * powers)[:, None, :]
+    return bent, across, by_value
 
 
 BEND = {"pinhole": _brown_conrady, "fisheye": _fisheye}
@@ -143,33 +168,23 @@ BEND = {"pinhole": _brown_conrady, "fisheye": _fisheye}
 def rays(lens: Lens, pixels: np.ndarray) -> np.ndarray:
     """Return the ray direction (X/Z, Y/Z) (N, 2) of each pixel (N, 2), by Newton's method; NaN without a solution."""
     distorted = (pixels - lens.values[2:4]) / lens.values[:2]
+    plane = distorted.copy()
     if lens.model == "fisheye":
-        long = np.linalg.norm(distorted, axis=1)
-        start = np.tan(np.clip(long, 0.0, 1.5)) / np.maximum(long, 1e-12)
+        length = np.linalg.norm(distorted, axis=1)
+        start = np.tan(np.clip(length, 0.0, 1.5)) / np.maximum(length, 1e-12)
         plane = distorted * start[:, None]
-    else:
-        plane = distorted.copy()
-    iterations = 20  # of the inverse; Newton's, so that a handful does
-    for _ in range(iterations):
+    for _ in range(ITERATIONS):
         bent, across, _ = BEND[lens.model](plane, lens.values[4:])
-        error = bent - distorted
-        determinant = across[:, 0, 0] * across[:, 1, 1] - across[:, 0, 1] * across[:, 1, 0]
+        error_x, error_y = (bent - distorted).T
+        (xx, xy), (yx, yy) = np.moveaxis(across, 0, -1)
+        determinant = xx * yy - xy * yx
         determinant = np.where(np.abs(determinant) < 1e-9, np.nan, determinant)
-        step = np.stack(
-            [
-                across[:, 1, 1] * error[:, 0] - across[:, 0, 1] * error[:, 1],
-                across[:, 0, 0] * error[:, 1] - across[:, 1, 0] * error[:, 0],
-            ],
-            axis=1,
-        )
-        plane = plane - step / determinant[:, None]
-        if np.nanmax(np.abs(error), initial=0.0) < 1e-12:
+        step_x = yy * error_x - xy * error_y
+        step_y = xx * error_y - yx * error_x
+        plane = plane - np.stack([step_x, step_y], axis=1) / determinant[:, None]
+        if np.nanmax(np.abs(bent - distorted), initial=0.0) < 1e-12:
             break
     return plane
-
-
-LENS = "camera.yaml"
-MODELS = {"plumb_bob": "pinhole", "rational_polynomial": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
 
 
 def read_lens(path: str | Path) -> Lens:
@@ -187,32 +202,46 @@ def read_lens(path: str | Path) -> Lens:
         raise MeasurementError(f"cannot be read as YAML ({str(error).splitlines()[0]})", path) from error
     if not isinstance(table, dict):
         raise MeasurementError("is not a camera_info file: expected image_width, camera_matrix, distortion_model", path)
-    size = (_whole(table, ("image_width", "width"), path), _whole(table, ("image_height", "height"), path))
+    width = _pixel_count(table, ("image_width", "width"), path)
+    height = _pixel_count(table, ("image_height", "height"), path)
     matrix = _numbers(table, ("camera_matrix", "K", "k"), path)
     if len(matrix) != 9 or matrix[8] != 1.0 or abs(matrix[1]) > 1e-6 * abs(matrix[0]):
         raise MeasurementError(f"camera_matrix: expected [fx 0 cx 0 fy cy 0 0 1], found {matrix.tolist()}", path)
-    bend = _numbers(table, ("distortion_coefficients", "D", "d"), path)
+    coefficients = _numbers(table, ("distortion_coefficients", "D", "d"), path)
     name = str(table.get("distortion_model") or "plumb_bob").lower()
-    message = f"distortion_model '{name}'{suggestion(name, MODELS)} is unknown; expected one of {', '.join(MODELS)}"
-    require(name in MODELS, message, MeasurementError, path)
-    allowed = {"plumb_bob": (0, 4, 5), "rational_polynomial": (8,)}.get(name, (4,))
-    if len(bend) not in allowed:
-        raise MeasurementError(f"distortion_model {name} has {allowed[-1]} coefficients, found {len(bend)}", path)
-    full = np.concatenate([bend, np.zeros(5 - len(bend))]) if name == "plumb_bob" else bend
+    if name not in MODELS:
+        message = f"distortion_model '{name}'{suggestion(name, MODELS)} is unknown; expected one of {', '.join(MODELS)}"
+        raise MeasurementError(message, path)
+    allowed = COEFFICIENTS.get(name, (4,))
+    if len(coefficients) not in allowed:
+        message = f"distortion_model {name} has {allowed[-1]} coefficients, found {len(coefficients)}"
+        raise MeasurementError(message, path)
+    if name == "plumb_bob":
+        coefficients = np.concatenate([coefficients, np.zeros(5 - len(coefficients))])
+    intrinsics = matrix[[0, 4, 2, 5]]
     with refused_as(MeasurementError, CalibError, "{}", path):
-        return Lens(MODELS[name], np.concatenate([matrix[[0, 4, 2, 5]], full]), size)
+        return Lens(MODELS[name], np.concatenate([intrinsics, coefficients]), (width, height))
 
 
-def _whole(table: dict[str, object], keys: tuple[str, ...], path: str | Path) -> int:
-    value = next((table[key] for key in keys if key in table), None)
+def _entry(table: dict[str, object], keys: tuple[str, ...]) -> object:
+    """Return the value of the first of some keys that a table has; None without any."""
+    for key in keys:
+        if key in table:
+            return table[key]
+    return None
+
+
+def _pixel_count(table: dict[str, object], keys: tuple[str, ...], path: str | Path) -> int:
+    value = _entry(table, keys)
     if not isinstance(value, int) or not 0 < value < 100_000:
         raise MeasurementError(f"{keys[0]}: expected a number of pixels, found {shown(value)}", path)
     return value
 
 
 def _numbers(table: dict[str, object], keys: tuple[str, ...], path: str | Path) -> np.ndarray:
-    value = next((table[key] for key in keys if key in table), None)
-    value = value.get("data") if isinstance(value, dict) else value
+    value = _entry(table, keys)
+    if isinstance(value, dict):
+        value = value.get("data")
     try:
         numbers = np.array(value, dtype=float).ravel()
     except (TypeError, ValueError, OverflowError):
@@ -224,15 +253,20 @@ def _numbers(table: dict[str, object], keys: tuple[str, ...], path: str | Path) 
 
 def write_lens(lens: Lens, path: str | Path, name: str = "camera") -> Path:
     """Write a lens as ``camera_info`` YAML."""
-    fx, fy, cx, cy = (float(value) for value in lens.values[:4])
-    model = "equidistant" if lens.model == "fisheye" else "plumb_bob" if len(lens.values) == 9 else None
+    fx, fy, cx, cy = lens.values[:4].tolist()
+    coefficients = lens.values[4:].tolist()
+    model = "rational_polynomial"
+    if lens.model == "fisheye":
+        model = "equidistant"
+    elif len(lens.values) == 9:
+        model = "plumb_bob"
     lines = [
         f"image_width: {lens.size[0]}",
         f"image_height: {lens.size[1]}",
         f"camera_name: {name}",
         _matrix("camera_matrix", 3, 3, [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]),
-        f"distortion_model: {model or 'rational_polynomial'}",
-        _matrix("distortion_coefficients", 1, len(lens.values) - 4, lens.values[4:].tolist()),
+        f"distortion_model: {model}",
+        _matrix("distortion_coefficients", 1, len(coefficients), coefficients),
         _matrix("rectification_matrix", 3, 3, np.eye(3).ravel().tolist()),
         _matrix("projection_matrix", 3, 4, [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]),
     ]
@@ -240,4 +274,5 @@ def write_lens(lens: Lens, path: str | Path, name: str = "camera") -> Path:
 
 
 def _matrix(name: str, rows: int, columns: int, data: list[float]) -> str:
-    return f"{name}:\n  rows: {rows}\n  cols: {columns}\n  data: [{', '.join(repr(value) for value in data)}]"
+    numbers = ", ".join(repr(value) for value in data)
+    return f"{name}:\n  rows: {rows}\n  cols: {columns}\n  data: [{numbers}]"

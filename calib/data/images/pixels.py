@@ -86,7 +86,8 @@ class Pixels(PoseMeasurements):
 
 
 HEADER = ("image", "corner", "u [px]", "v [px]", "sigma [px]", "edge [px]", "problem")
-USUAL = 0.1  # sigma where a file states none [px]; our choice
+# sigma where a file states none [px]; our choice
+USUAL = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,18 +126,9 @@ def write_corners(path: Path, detections: Found) -> Path:
     for name, detection in detections.images.items():
         if detection.problem:
             rows.append([name, None, None, None, None, detection.edge, detection.problem])
-        rows += [
-            [
-                name,
-                int(k),
-                float(detection.pixel[k, 0]),
-                float(detection.pixel[k, 1]),
-                float(detection.sigma[k]),
-                detection.edge,
-                "",
-            ]
-            for k in np.flatnonzero(detection.seen)
-        ]
+        for k in np.flatnonzero(detection.seen).tolist():
+            u, v = detection.pixel[k].tolist()
+            rows.append([name, k, u, v, float(detection.sigma[k]), detection.edge, ""])
     return files.write_table(path, HEADER, rows)
 
 
@@ -148,7 +140,9 @@ def read_corners(path: Path, board: Board) -> Found:
     """
     import csv
 
-    count, images, size = len(corners(board)), dict[str, Detection](), (0, 0)
+    count = len(corners(board))
+    images = dict[str, Detection]()
+    size = (0, 0)
     kinds = (OSError, UnicodeDecodeError, csv.Error)
     readable = refused_as(MeasurementError, kinds, "cannot be read as a table ({})", path)
     with readable, path.open(encoding="utf-8-sig", newline="") as file:
@@ -156,7 +150,10 @@ def read_corners(path: Path, board: Board) -> Found:
     for number, row in enumerate(rows, 1):
         if "further cells" in row:
             refuse_data(path, "has more cells than the header names columns", row=number)
-        cells = {(key or "").split("[")[0].strip(): (value or "").strip() for key, value in row.items()}
+        cells = {}
+        for heading, cell in row.items():
+            key = (heading or "").split("[")[0].strip()
+            cells[key] = (cell or "").strip()
         name, problem = cells.get("image", ""), cells.get("problem", "")
         with refused_as(
             MeasurementError, (KeyError, ValueError, OverflowError), "expected image, corner, u, v ({})", path, number
@@ -165,13 +162,15 @@ def read_corners(path: Path, board: Board) -> Found:
                 size = int(float(cells["u"])), int(float(cells["v"]))
                 continue
             if name not in images:
-                images[name] = Detection(
-                    np.full((count, 2), np.nan), np.full(count, np.nan), problem, float(cells.get("edge") or "nan")
-                )
+                no_pixels, no_sigmas = np.full((count, 2), np.nan), np.full(count, np.nan)
+                edge = float(cells.get("edge") or "nan")
+                images[name] = Detection(no_pixels, no_sigmas, problem, edge)
             if problem or not cells.get("corner"):
                 continue
-            k, corner_pixel = int(cells["corner"]), (float(cells["u"]), float(cells["v"]))
+            k = int(cells["corner"])
+            corner_pixel = float(cells["u"]), float(cells["v"])
         if not 0 <= k < count:
             refuse_data(path, f"corner {k}: the board ({board.words}) has {count}", "corner", number)
-        images[name].pixel[k], images[name].sigma[k] = corner_pixel, float(cells.get("sigma") or USUAL)
+        images[name].pixel[k] = corner_pixel
+        images[name].sigma[k] = float(cells.get("sigma") or USUAL)
     return Found(images, size)

@@ -26,8 +26,28 @@ from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 from calib.transforms import invert, pose, to_quaternion
 
-ODD = 8.0  # robust deviations from which on a corner does not fit into its image, and is left out
-LOST = 0.2  # median misfit over the distance to the board beyond which nothing is placed
+# robust deviations from which on a corner does not fit into its image, and is left out
+ODD = 8.0
+# median misfit over the distance to the board beyond which nothing is placed
+LOST = 0.2
+# images whose corners are looked at together
+MAX_AT_ONCE = 500
+# median length of a vector of two standard normals
+MEDIAN_LENGTH = 1.1774
+# of leaving corners out
+MAX_ROUNDS = 4
+# corners, and images, that a note names
+MAX_CORNERS_NAMED, MAX_IMAGES_NAMED = 3, 5
+# share of images that may contradict the others, and are left out; more are refused
+MAX_STRANGE = 0.3
+# images that a camera is placed by, at least and at most (our choice)
+MIN_IMAGES, MAX_IMAGES = 3, 100
+# a mounting is found where the other one's misfit is so many times as large
+MIN_CONTRAST = 3.0
+# of the misfit that remains with the rows shifted: they were
+MAX_SHIFTED_SHARE = 0.25
+# relative error of the board's scale that is refused
+MAX_SCALE_ERROR = 0.04
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,25 +81,34 @@ def complete_camera(chain: Chain, block: Pixels, fitted_blocks: Sequence[PoseMea
         MeasurementError: where images and joints do not belong together, or the board is not of the stated size.
     """
     original = block
-    for fitted in fitted_blocks:
-        if block.lens is None and isinstance(fitted, Pixels) and fitted.size == block.size and fitted.lens is not None:
-            block = replace(block, lens=fitted.lens, mounting=block.mounting or fitted.mounting, free=())
+    if block.lens is None:
+        block = _with_fitted_lens(block, fitted_blocks)
     if block.lens is None:
         if not block.size[0]:
             raise MeasurementError("image size unknown: no lens (camera.yaml) and no image was given", block.file)
-        block = replace(block, lens=estimate_lens(block.board, block.pixel, block.size, block.model, block.file))
+        lens = estimate_lens(block.board, block.pixel, block.size, block.model, block.file)
+        block = replace(block, lens=lens)
     arm = forward(chain, block.q)
     placement = place_camera(block, arm)
     _check_square(block, arm[placement.rows], placement)
     block = replace(block, mounting=placement.mounting)
-    poses = _own_poses(block, np.arange(len(block)))
+    all_rows = np.arange(len(block))
+    poses = _own_poses(block, all_rows)
     strange, exclusion_note = _strangers(block, arm, placement.placed, poses)
-    if len(strange):  # and once more without them, the lens too
-        consistent = take(
-            replace(original, notes=(*original.notes, exclusion_note)), np.setdiff1d(np.arange(len(block)), strange)
-        )
+    if len(strange):
+        # and once more without them, the lens too
+        noted = replace(original, notes=(*original.notes, exclusion_note))
+        consistent = take(noted, np.setdiff1d(all_rows, strange))
         return complete_camera(chain, consistent, fitted_blocks)
     return _without_gross_corners(block, poses)
+
+
+def _with_fitted_lens(block: Pixels, fitted_blocks: Sequence[PoseMeasurements]) -> Pixels:
+    """Return the block with the lens of the first fitted block of images of its size; unchanged without any."""
+    for fitted in fitted_blocks:
+        if isinstance(fitted, Pixels) and fitted.size == block.size and fitted.lens is not None:
+            return replace(block, lens=fitted.lens, mounting=block.mounting or fitted.mounting, free=())
+    return block
 
 
 def _lens_of(block: Pixels) -> Lens:
@@ -89,42 +118,39 @@ def _lens_of(block: Pixels) -> Lens:
     return block.lens
 
 
-def _own_poses(block: Pixels, rows: np.ndarray, max_at_once: int = 500) -> np.ndarray:
-    """Return the board's pose (k, 4, 4) in the camera's frame for each of the given rows.
-
-    `max_at_once`: images whose corners are looked at together.
-    """
-    row_chunks, lens = np.array_split(rows, len(rows) // max_at_once + 1), _lens_of(block)
-    return np.concatenate([board_poses(lens, block.board, block.pixel[row_chunk]).poses for row_chunk in row_chunks])
+def _own_poses(block: Pixels, rows: np.ndarray) -> np.ndarray:
+    """Return the board's pose (k, 4, 4) in the camera's frame for each of some rows (k,)."""
+    lens = _lens_of(block)
+    chunks = np.array_split(rows, len(rows) // MAX_AT_ONCE + 1)
+    return np.concatenate([board_poses(lens, block.board, block.pixel[chunk]).poses for chunk in chunks])
 
 
-def _without_gross_corners(block: Pixels, poses: np.ndarray, median_length: float = 1.1774) -> Pixels:
+def _without_gross_corners(block: Pixels, poses: np.ndarray) -> Pixels:
     """Return the block without outlier corners; the removed corners are named in its notes.
 
     A gross corner moves the pose that the others are judged by: the worst go first, and poses (m, 4, 4) are found anew.
-
-    `median_length`: of the length of a vector of two standard normals.
     """
     lens, table, before = _lens_of(block), corners(block.board), block.seen
-    off, stale = np.full(before.shape, np.nan), np.arange(len(block))
-    max_rounds = 4  # of leaving corners out
-    for _ in range(max_rounds):
+    distance = np.full(before.shape, np.nan)
+    stale = np.arange(len(block))
+    for _ in range(MAX_ROUNDS):
         point = np.einsum("mij,kj->mki", poses[:, :3, :3], table) + poses[:, None, :3, 3]
         flat = lens.project(point.reshape(-1, 3)).reshape(*point.shape[:2], 2)
-        off[stale] = np.linalg.norm(block.pixel[stale] - flat, axis=2)
-        gross = off > ODD * np.nanmedian(off) / median_length
-        gross &= off >= 0.5 * np.nanmax(off, axis=1, keepdims=True, initial=0.0)
+        distance[stale] = np.linalg.norm(block.pixel[stale] - flat, axis=2)
+        largest = np.nanmax(distance, axis=1, keepdims=True, initial=0.0)
+        is_odd = distance > ODD * np.nanmedian(distance) / MEDIAN_LENGTH
+        gross = is_odd & (distance >= 0.5 * largest)
         if not gross.any():
             break
         block = replace(block, pixel=np.where(gross[:, :, None], np.nan, block.pixel))
         stale = np.flatnonzero(gross.any(axis=1))
         poses = _own_poses(block, stale)
-    gone = np.argwhere(before & ~block.seen)
-    if not len(gone):
+    excluded = np.argwhere(before & ~block.seen)
+    if not len(excluded):
         return block
-    max_named = 3
-    corner_names = listing((f"corner {k} of {block.name(int(block.rows[row]))}" for row, k in gone), max_named)
-    note = f"{len(gone)} of {before.sum()} corners are outliers in their image, excluded: {corner_names}"
+    names = [f"corner {corner} of {block.name(int(block.rows[row]))}" for row, corner in excluded]
+    corner_names = listing(names, MAX_CORNERS_NAMED)
+    note = f"{len(excluded)} of {before.sum()} corners are outliers in their image, excluded: {corner_names}"
     return replace(block, notes=(*block.notes, note))
 
 
@@ -144,25 +170,28 @@ def _strangers(block: Pixels, arm: np.ndarray, placed: Placement, poses: np.ndar
     strange = np.flatnonzero(misfits > max_misfit)
     if not len(strange):
         return strange, ""
-    turned = board_misfit(pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)) @ poses)[strange] <= max_misfit
-    cause = (
-        "they match if turned by 180°; did a program rotate them?"
-        if turned.mean() > 0.5
-        else "wrong joint values, or was camera or board moved?"
-    )
-    description = (
-        f"show the board {1e3 * float(np.median(misfits[strange])):.0f} mm from its place in all other images: {cause}"
-    )
-    description += f" ({listing((block.name(int(block.rows[row])) for row in strange), 5)})"
-    max_strange = 0.3  # share of images that may contradict the others, and are left out; more are refused
-    if len(strange) > max_strange * len(block):
+
+    half_turn = pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    fits_turned = board_misfit(half_turn @ poses)[strange] <= max_misfit
+    cause = "wrong joint values, or was camera or board moved?"
+    if fits_turned.mean() > 0.5:
+        cause = "they match if turned by 180°; did a program rotate them?"
+    distance_mm = 1e3 * float(np.median(misfits[strange]))
+    names = listing((block.name(int(block.rows[row])) for row in strange), MAX_IMAGES_NAMED)
+    description = f"show the board {distance_mm:.0f} mm from its place in all other images: {cause} ({names})"
+    if len(strange) > MAX_STRANGE * len(block):
         raise MeasurementError(f"{len(strange)} of {len(block)} images {description}", block.file)
-    return strange, f"{len(strange)} image{'s are' if len(strange) > 1 else ' is'} excluded: they {description}"
+    images = "image is"
+    if len(strange) > 1:
+        images = "images are"
+    return strange, f"{len(strange)} {images} excluded: they {description}"
 
 
 def seen_target(mounting: str, poses: np.ndarray) -> np.ndarray:
     """Return the moving body's poses (m, 4, 4) in the fixed one's frame (camera and board), from board poses."""
-    return invert(poses) if mounting == IN_HAND else poses
+    if mounting == IN_HAND:
+        return invert(poses)
+    return poses
 
 
 def pnp_poses(block: Pixels) -> Poses:
@@ -191,27 +220,26 @@ def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:
     Raises:
         MeasurementError: where images and joints do not belong together.
     """
-    max_images = 100  # images that it is placed by (our choice)
-    rows = evenly(len(block), max_images)
+    rows = evenly(len(block), MAX_IMAGES)
     pnp = board_poses(_lens_of(block), block.board, block.pixel[rows])
     good = np.flatnonzero(np.isfinite(pnp.rms))
-    min_images = 3  # images that place a camera at all
-    if len(good) < min_images:
+    if len(good) < MIN_IMAGES:
         raise MeasurementError(
-            f"{len(good)} images with a board do not determine the camera: at least {min_images} from different sides, "
+            f"{len(good)} images with a board do not determine the camera: at least {MIN_IMAGES} from different sides, "
             "20 to 40 for a calibration",
             block.file,
         )
     rows, poses = rows[good], pnp.poses[good]
     lever = float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1)))
-    choices = [block.mounting] if block.mounting else [IN_HAND, TO_HAND]
-    placements = {candidate: place_robustly(arm[rows], seen_target(candidate, poses), lever) for candidate in choices}
+    mountings = [block.mounting] if block.mounting else [IN_HAND, TO_HAND]
+    placements = {}
+    for candidate in mountings:
+        placements[candidate] = place_robustly(arm[rows], seen_target(candidate, poses), lever)
     mounting = min(placements, key=lambda candidate: placements[candidate].error)
-    _check_pairing(block, arm[rows], poses, choices, placements[mounting], lever)
-    min_contrast = 3.0  # a mounting is found where the other one's misfit is so many times as large
+    _check_pairing(block, arm[rows], poses, mountings, placements[mounting], lever)
     if len(placements) == 2:
         smaller, larger = sorted(candidate.error for candidate in placements.values())
-        if larger < min_contrast * smaller:
+        if larger < MIN_CONTRAST * smaller:
             raise MeasurementError(
                 f"whether the arm carries the camera or the board cannot be determined ({1e3 * smaller:.1f} against "
                 f"{1e3 * larger:.1f} mm): state in the options [camera] mounting = 'in hand' or 'to hand'",
@@ -226,18 +254,19 @@ def _check_pairing(
     """Raise if the joint values are shifted against the images by some rows, or do not match them at all."""
     if placed.error <= 0.01 * lever or len(arm) < 6:
         return
-    max_left = 0.25  # of the misfit is left with the rows shifted: they were
+    count = len(arm)
     for shift, mounting in product((-1, 1, -2, 2), mountings):
         targets = seen_target(mounting, poses)
-        overlap = slice(max(shift, 0), len(arm) + min(shift, 0)), slice(max(-shift, 0), len(arm) + min(-shift, 0))
-        shifted = place_robustly(arm[overlap[0]], targets[overlap[1]], lever)
-        if shifted.error < max_left * placed.error:
+        arm_rows = slice(max(shift, 0), count + min(shift, 0))
+        target_rows = slice(max(-shift, 0), count + min(-shift, 0))
+        shifted = place_robustly(arm[arm_rows], targets[target_rows], lever)
+        if shifted.error < MAX_SHIFTED_SHARE * placed.error:
             rows = counted(abs(shift), "row")
+            direction = "further down" if shift > 0 else "further up"
             raise MeasurementError(
                 f"images and joint values are shifted by {rows}: the median board error is "
                 f"{1e3 * placed.error:.0f} mm as recorded; paired with the joints {rows} "
-                f"{'further down' if shift > 0 else 'further up'} by {1e3 * shifted.error:.1f} mm; correct the column "
-                "'image'",
+                f"{direction} by {1e3 * shifted.error:.1f} mm; correct the column 'image'",
                 block.file,
             )
     if placed.error > LOST * lever:
@@ -249,30 +278,32 @@ def _check_pairing(
         )
 
 
-def _check_square(block: Pixels, arm: np.ndarray, placement: CameraPlacement, max_scale_error: float = 0.04) -> None:
+def _check_square(block: Pixels, arm: np.ndarray, placement: CameraPlacement) -> None:
     """Raise if the stated square size contradicts the size computed from the arm's motion.
 
     Of B_i = S A_i X with the board's lengths times λ, for fixed rotations, the translations are linear in λ.
-
-    `max_scale_error`: relative error of the board's scale that is refused.
     """
-    placed, count = placement.placed, len(arm)
-    turn, targets = placed.station[:3, :3], seen_target(placement.mounting, placement.poses)
+    placed = placement.placed
+    count = len(arm)
     if count < 6:
         return
+    turn = placed.station[:3, :3]
+    targets = seen_target(placement.mounting, placement.poses)
     rows = np.zeros((count, 3, 7))
     rows[:, :, 0] = -targets[:, :3, 3]
     rows[:, :, 1:4] = turn @ arm[:, :3, :3]
     rows[:, :, 4:] = np.eye(3)
     target = -(arm[:, :3, 3] @ turn.T)
-    keep = placed.misfit <= np.quantile(placed.misfit, 0.8)
-    matrix, translations = rows[keep].reshape(-1, 7), target[keep].ravel()
+    consistent = placed.misfit <= np.quantile(placed.misfit, 0.8)
+    matrix = rows[consistent].reshape(-1, 7)
+    translations = target[consistent].ravel()
     solution, _, rank, _ = np.linalg.lstsq(matrix, translations, rcond=1e-6)
     spare = max(len(translations) - 7, 1)
-    noise = float(np.linalg.norm(matrix @ solution - translations)) / np.sqrt(spare)
+    error = matrix @ solution - translations
+    noise = float(np.linalg.norm(error)) / np.sqrt(spare)
     sigma = noise * float(np.sqrt(np.linalg.pinv(matrix.T @ matrix)[0, 0]))
     factor = float(solution[0])
-    if rank == 7 and abs(factor - 1.0) > max(max_scale_error, 6.0 * sigma) and sigma < 0.1:
+    if rank == 7 and abs(factor - 1.0) > max(MAX_SCALE_ERROR, 6.0 * sigma) and sigma < 0.1:
         square_mm = 1e3 * block.board.square
         raise MeasurementError(
             f"a square of the board is {square_mm * factor:.2f} mm (±{square_mm * sigma:.2f}) by the arm's motion, "

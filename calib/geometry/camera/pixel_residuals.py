@@ -35,6 +35,18 @@ from calib.records import Frozen
 
 # change of a noise that repeats no fit, as a share, and of its [m, rad] (our choice)
 MAX_NOISE_CHANGE, MIN_NOISE = 0.05, 2e-6
+# change of an image's weight that repeats no fit
+MAX_WEIGHT_CHANGE = 0.05
+# squared residuals beyond so many times their median are taken for it (our choice)
+MAX_RATIO = 25.0
+# of the search for a variance component
+MAX_STEPS = 20
+# displacement [m] and turn [rad] of an image that a fit begins with (our choice)
+FIRST_NOISE = 1e-4
+# tangent of the angle off the axis beyond which a corner is taken at it
+STEEPEST = {"pinhole": 2.0, "fisheye": 10.0}
+# images reduced at once
+CHUNK = 500
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,8 +80,11 @@ class ImageNoise(Frozen):
     def near(self, noise: ImageNoise) -> bool:
         """Return whether two noise estimates agree, so that the fit is not repeated."""
         pairs = ((self.factor, noise.factor), (self.displacement, noise.displacement), (self.turn, noise.turn))
-        alike = all(abs(a - b) <= MAX_NOISE_CHANGE * max(a, b) + MIN_NOISE for a, b in pairs)
-        return alike and np.abs(self.weight - noise.weight).max(initial=0.0) < 0.05
+        for a, b in pairs:
+            if abs(a - b) > MAX_NOISE_CHANGE * max(a, b) + MIN_NOISE:
+                return False
+        weight_change = np.abs(self.weight - noise.weight).max(initial=0.0)
+        return bool(weight_change < MAX_WEIGHT_CHANGE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,37 +114,46 @@ def estimate_noise(fits: OwnPoses, unknowns: int, loss: str = "none", scale: flo
     """
     k = len(fits.spare)
     share = max(1.0 - unknowns / max(6 * k, 1), 0.2)
-    use = fits.spare > 0
+    # of the corners alone
     factor = 1.0
-    if use.any():
-        variances = fits.within[use] / fits.spare[use]
-        robustly = loss != "none"
-        factor = float(np.sqrt(np.median(variances) if robustly else fits.within[use].sum() / fits.spare[use].sum()))
+    determined = fits.spare > 0
+    if determined.any():
+        within, spare = fits.within[determined], fits.spare[determined]
+        variance = within.sum() / spare.sum()
+        if loss != "none":
+            variance = np.median(within / spare)
+        factor = float(np.sqrt(variance))
     factor = max(factor, 1e-3)
+
+    # of the images
     covariance = factor**2 * np.linalg.pinv(fits.information, hermitian=True)
-    variances_of_poses = np.einsum("kii->ki", covariance)
+    explained = np.einsum("kii->ki", covariance)
     square = fits.residual**2
-    max_ratio = 25.0  # squared residuals beyond so many times their median are taken for it (our choice)
-    square = np.minimum(square, max_ratio * np.median(square, axis=0)) / share
-    spread = [_component(square[:, axes], variances_of_poses[:, axes]) for axes in (slice(0, 3), slice(3, 6))]
-    total = covariance + np.diag(np.repeat(np.square(spread), 3))
-    size = np.sqrt(np.einsum("ki,ki->k", fits.residual, np.linalg.solve(total, fits.residual[:, :, None])[:, :, 0]) / 6)
-    return ImageNoise(factor, *spread, weight=robust.weights(size, loss, scale))
+    square = np.minimum(square, MAX_RATIO * np.median(square, axis=0)) / share
+    displacement = _component(square[:, :3], explained[:, :3])
+    turn = _component(square[:, 3:], explained[:, 3:])
+    variances = np.repeat(np.square([displacement, turn]), 3)
+    total = covariance + np.diag(variances)
+    weighted = np.linalg.solve(total, fits.residual[:, :, None])[:, :, 0]
+    size = np.sqrt(np.einsum("ki,ki->k", fits.residual, weighted) / 6)
+    return ImageNoise(factor, displacement, turn, weight=robust.weights(size, loss, scale))
 
 
-def _component(square: np.ndarray, explained: np.ndarray, max_steps: int = 20) -> float:
-    """Return the standard deviation s with E[t²] = s² + known, by maximum likelihood: Σ (t² - s² - c)/(s² + c)² = 0."""
-    value = max(float(np.mean(square - explained)), 1e-3 * float(np.median(square)))
-    for _ in range(max_steps):
+def _component(square: np.ndarray, explained: np.ndarray) -> float:
+    """Return the standard deviation s with E[t²] = s² + c, by maximum likelihood: Σ (t² - s² - c)/(s² + c)² = 0.
+
+    Args:
+        square: t² of each residual.
+        explained: c, its variance that is known.
+    """
+    excess = square - explained
+    value = max(float(np.mean(excess)), 1e-3 * float(np.median(square)))
+    for _ in range(MAX_STEPS):
         weight = 1.0 / (value + explained) ** 2
-        value = max(float(np.sum(weight * (square - explained)) / np.sum(weight)), 0.0)
+        value = max(float(np.sum(weight * excess) / np.sum(weight)), 0.0)
         if value == 0.0:
             break
     return float(np.sqrt(value))
-
-
-FIRST_NOISE = 1e-4  # displacement [m] and turn [rad] of an image that a fit begins with (our choice)
-STEEPEST = {"pinhole": 2.0, "fisheye": 10.0}  # tangent of the angle off the axis beyond which a corner is taken at it
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,20 +191,26 @@ class PixelPart(ResidualPart):
     def sizes(self) -> np.ndarray:
         square = np.sum((self.value / self.depth) ** 2, axis=0)
         count = np.bincount(self.index)
-        return np.sqrt(np.bincount(self.index, square)[count > 0] / count[count > 0])
+        sums = np.bincount(self.index, square)
+        in_image = count > 0
+        return np.sqrt(sums[in_image] / count[in_image])
 
     def per_row(self) -> ResidualPart:
         images, image, count = np.unique(self.index, return_inverse=True, return_counts=True)
-        mean = np.array([np.bincount(image, axis / self.depth) / count for axis in self.value])
-        flat = np.vstack([mean, np.zeros(len(images))])  # along the line of sight a mean offset says nothing
-        return ResidualPart(
-            "position", np.einsum("mij,jm->im", self.axes[images], flat), self.jacobian[:, :0], None, 0, images
-        )
+        lengths_x, lengths_y = self.value / self.depth
+        mean_x = np.bincount(image, lengths_x) / count
+        mean_y = np.bincount(image, lengths_y) / count
+        # along the line of sight a mean offset says nothing
+        mean = np.vstack([mean_x, mean_y, np.zeros(len(images))])
+        displacement = np.einsum("mij,jm->im", self.axes[images], mean)
+        return ResidualPart("position", displacement, self.jacobian[:, :0], None, 0, images)
 
     def row_weights(self, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         images, image, count = np.unique(self.index, return_inverse=True, return_counts=True)
         mean = np.bincount(image, weight) / count
-        return images, mean if self.noise is None else mean * self.noise.weight[images]
+        if self.noise is None:
+            return images, mean
+        return images, mean * self.noise.weight[images]
 
     def fill(self, residual: np.ndarray, matrix: np.ndarray, scale: np.ndarray) -> None:
         scale = np.broadcast_to(scale, self.value.shape)
@@ -189,40 +219,45 @@ class PixelPart(ResidualPart):
         width = self.local.shape[2] + 1
         shared = None
         if self.noise is not None:
-            shared = self._shared_errors(self.noise) if self.noise.shared is None else self.noise.shared
-        chunk = 500  # images reduced at once
-        for start in range(0, len(images), chunk):
-            chunk_images = slice(start, min(start + chunk, len(images)))
-            rows, counts = (
-                slice(edges[chunk_images.start], edges[chunk_images.stop]),
-                np.diff(edges[chunk_images.start : chunk_images.stop + 1]),
-            )
+            shared = self.noise.shared
+            if shared is None:
+                shared = self._shared_errors(self.noise)
+        for start in range(0, len(images), CHUNK):
+            stop = min(start + CHUNK, len(images))
+            chunk = images[start:stop]
+            rows = slice(edges[start], edges[stop])
+            counts = np.diff(edges[start : stop + 1])
             unit = scale.T[rows, :, None]
-            table = np.concatenate([self.local[rows], self.value.T[rows, :, None]], axis=2) / unit
-            padded = _padded(table, counts)
+            columns = [self.local[rows], self.value.T[rows, :, None]]
+            padded = _padded(np.concatenate(columns, axis=2) / unit, counts)
             if shared is not None and self.noise is not None:
                 padded = _whitened(padded, _padded(shared[rows] / unit, counts, padded.shape[1]))
-                padded = padded * np.sqrt(self.noise.weight[images[chunk_images]])[:, None, None]
-            small = np.asarray(np.linalg.qr(padded, mode="r"))
-            reduced_rows = slice(chunk_images.start * width, chunk_images.stop * width)
-            residual[reduced_rows] = small[:, :, -1].ravel()
-            by_image = self.jacobian[:, :, images[chunk_images]].transpose(2, 1, 0)
-            matrix[:, reduced_rows] = (small[:, :, :-1] @ by_image).reshape(-1, len(self.jacobian)).T
+                padded = padded * np.sqrt(self.noise.weight[chunk])[:, None, None]
+            triangle = np.asarray(np.linalg.qr(padded, mode="r"))
+            reduced_rows = slice(start * width, stop * width)
+            residual[reduced_rows] = triangle[:, :, -1].ravel()
+            by_image = self.jacobian[:, :, chunk].transpose(2, 1, 0)
+            reduced = triangle[:, :, :-1] @ by_image
+            matrix[:, reduced_rows] = reduced.reshape(-1, len(self.jacobian)).T
 
     def _shared_errors(self, noise: ImageNoise) -> np.ndarray:
-        return np.einsum("ncl,nlk->nck", self.local[:, :, :6], self.carried[self.index]) * noise.deviations
+        by_twist = self.local[:, :, :6]
+        return np.einsum("ncl,nlk->nck", by_twist, self.carried[self.index]) * noise.deviations
 
     def own_poses(self, scale: np.ndarray) -> OwnPoses:
         """Return the fit of a free pose to each image, with corner σ `scale` (2, N) [px]."""
         images, first = np.unique(self.index, return_index=True)
         counts = np.diff(np.append(first, len(self.index)))
-        table = np.concatenate([self.local[:, :, :6], self.value.T[:, :, None]], axis=2) / scale.T[:, :, None]
-        small = np.asarray(np.linalg.qr(_padded(table, counts), mode="r"))
-        system = small[:, :6, :6] @ self.carried[images]
+        columns = [self.local[:, :, :6], self.value.T[:, :, None]]
+        table = np.concatenate(columns, axis=2) / scale.T[:, :, None]
+        triangle = np.asarray(np.linalg.qr(_padded(table, counts), mode="r"))
+        system = triangle[:, :6, :6] @ self.carried[images]
         information = system.transpose(0, 2, 1) @ system
-        gradient = np.einsum("kji,kj->ki", system, small[:, :6, 6])
-        residual = np.einsum("kij,kj->ki", np.linalg.pinv(information, hermitian=True), gradient)
-        return OwnPoses(residual, information, small[:, 6, 6] ** 2, np.maximum(2 * counts - 6, 0))
+        gradient = np.einsum("kji,kj->ki", system, triangle[:, :6, 6])
+        inverse = np.linalg.pinv(information, hermitian=True)
+        residual = np.einsum("kij,kj->ki", inverse, gradient)
+        spare = np.maximum(2 * counts - 6, 0)
+        return OwnPoses(residual, information, triangle[:, 6, 6] ** 2, spare)
 
     def common_noise(self, sigma: np.ndarray, unknowns: int, loss: str, scale: float | None, start: bool) -> ImageNoise:
         noise = estimate_noise(self.own_poses(sigma), unknowns, loss, scale)
@@ -237,16 +272,20 @@ class PixelPart(ResidualPart):
         images, image = np.unique(self.index, return_inverse=True)
         fits = self.own_poses(sigma)
         twists = np.einsum("kij,kj->ki", self.carried[images], fits.residual)
-        return self.value - np.einsum("ncl,nl->cn", self.local[:, :, :6], twists[image])
+        by_twist = self.local[:, :, :6]
+        return self.value - np.einsum("ncl,nl->cn", by_twist, twists[image])
 
 
 def _padded(table: np.ndarray, counts: np.ndarray, height: int = 0) -> np.ndarray:
     """Return corner rows (N, 2, w) as one block per image (images, height, w), filled up with zeros."""
     width = table.shape[2]
-    max_corners = height // 2 or max(int(counts.max(initial=0)), (width + 1) // 2)
-    padded = np.zeros((len(counts), max_corners, 2, width))
+    max_corners = height // 2
+    if not max_corners:
+        max_corners = max(int(counts.max(initial=0)), (width + 1) // 2)
     image = np.repeat(np.arange(len(counts)), counts)
-    padded[image, np.arange(len(table)) - np.repeat(np.cumsum(counts) - counts, counts)] = table
+    first = np.repeat(np.cumsum(counts) - counts, counts)
+    padded = np.zeros((len(counts), max_corners, 2, width))
+    padded[image, np.arange(len(table)) - first] = table
     return padded.reshape(len(counts), 2 * max_corners, width)
 
 
@@ -257,43 +296,61 @@ def _whitened(rows: np.ndarray, shared: np.ndarray) -> np.ndarray:
     axes = shared @ vectors
     # U (1 - 1/sqrt(1 + s²)) Uᵀ with U = G V / s
     factor = (1.0 - 1.0 / np.sqrt(1.0 + values)) / np.maximum(values, 1e-300)
-    return rows - axes @ (factor[:, :, None] * (axes.transpose(0, 2, 1) @ rows))
+    along = axes.transpose(0, 2, 1) @ rows
+    return rows - axes @ (factor[:, :, None] * along)
 
 
 @parts.register
 def _pixels(measured: Pixels, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
     """Return the corner residuals r = y - π(point) of a block of images, with their Jacobians."""
-    if seen.view is None:
+    view = seen.view
+    if view is None:
         refuse_data(measured.file, "the camera of these images is unknown")
-    view, in_hand = seen.view, measured.mounting == IN_HAND
+    in_hand = measured.mounting == IN_HAND
+    count = len(measured)
+    lens_count = len(view.in_view)
     image, corner = np.nonzero(measured.seen)
-    points, bend = shape_slopes(measured.board, view.shape, corners(measured.board))
-    turn = np.moveaxis(seen.rotation, 0, -1).transpose(1, 0, 2)  # (m, 3, 3), columns are the target's axes
+
+    # the board in the camera's frame: (m, 3, 3) and (m, 3); columns are the target's axes
+    turn = np.moveaxis(seen.rotation, 0, -1).transpose(1, 0, 2)
     origin = seen.point.T
-    if in_hand:  # the target is the camera, in the board's frame
+    if in_hand:
+        # the target is the camera, in the board's frame
         turn = turn.transpose(0, 2, 1)
         origin = -np.einsum("mij,mj->mi", turn, origin)
+    points, bend = shape_slopes(measured.board, view.shape, corners(measured.board))
     turned = np.einsum("nij,nj->ni", turn[image], points[corner])
     point = turned + origin[image]
+    # of a wild guess, behind the camera
     aside = np.maximum(np.linalg.norm(point[:, :2], axis=1), 1e-3)
-    point[:, 2] = np.maximum(point[:, 2], aside / STEEPEST[view.lens.model])  # of a wild guess, behind the camera
+    point[:, 2] = np.maximum(point[:, 2], aside / STEEPEST[view.lens.model])
+
     pixel, by_point, by_lens = view.lens.project_with_slopes(point)
-    local = np.empty((len(image), 2, 6 + len(view.in_view)))
+    local = np.empty((len(image), 2, 6 + lens_count))
     local[:, :, :3] = by_point
-    local[:, :, 3:6] = np.cross(turned[:, None, :], by_point)  # g · (ω × c) = (c × g) · ω
-    if len(view.in_view):
-        by_shape = by_point @ np.einsum("nij,njs->nis", turn[image], bend[corner])
-        local[:, :, 6:] = np.concatenate([by_lens, by_shape], axis=2)[:, :, view.in_view]
-    shared = np.zeros((len(jacobian), 6 + len(view.in_view), len(measured)))
+    # g · (ω × c) = (c × g) · ω
+    local[:, :, 3:6] = np.cross(turned[:, None, :], by_point)
+    if lens_count:
+        turned_bend = np.einsum("nij,njs->nis", turn[image], bend[corner])
+        by_shape = by_point @ turned_bend
+        by_optics = np.concatenate([by_lens, by_shape], axis=2)
+        local[:, :, 6:] = by_optics[:, :, view.in_view]
+
+    shared = np.zeros((len(jacobian), 6 + lens_count, count))
     shared[:, :6] = _twist_of_board(jacobian, turn, origin) if in_hand else jacobian
-    shared[view.in_free, 6 + np.arange(len(view.in_view))] = 1.0
+    shared[view.in_free, 6 + np.arange(lens_count)] = 1.0
     value = (measured.pixel[image, corner] - pixel).T
-    sigma = None if measured.sigma is None else np.broadcast_to(measured.sigma[image, corner], value.shape)
-    depth = np.sqrt(np.abs(np.prod(view.lens.values[:2]))) / point[:, 2]
-    carried = np.tile(np.eye(6), (len(measured), 1, 1))
-    if in_hand:  # ω × (o - c): the camera turns about itself, and the board's origin swings
+    sigma = None
+    if measured.sigma is not None:
+        sigma = np.broadcast_to(measured.sigma[image, corner], value.shape)
+    focal = np.sqrt(np.abs(np.prod(view.lens.values[:2])))
+    depth = focal / point[:, 2]
+    carried = np.tile(np.eye(6), (count, 1, 1))
+    axes = np.tile(np.eye(3), (count, 1, 1))
+    if in_hand:
+        # ω × (o - c): the camera turns about itself, and the board's origin swings
         carried[:, :3, 3:] = np.cross(origin[:, None], np.eye(3))
-    axes = -turn.transpose(0, 2, 1) if in_hand else np.tile(np.eye(3), (len(measured), 1, 1))
+        axes = -turn.transpose(0, 2, 1)
     return [PixelPart("pixel", value, shared, sigma, 0, image, local, corner, depth, axes, carried)]
 
 
@@ -309,4 +366,5 @@ def _twist_of_board(jacobian: np.ndarray, turn: np.ndarray, origin: np.ndarray) 
     """
     omega = -np.einsum("mij,fjm->fim", turn, jacobian[:, 3:])
     velocity = -np.einsum("mij,fjm->fim", turn, jacobian[:, :3])
-    return np.concatenate([velocity + np.cross(omega, origin.T[None], axis=1), omega], axis=1)
+    swing = np.cross(omega, origin.T[None], axis=1)
+    return np.concatenate([velocity + swing, omega], axis=1)

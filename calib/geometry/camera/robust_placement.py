@@ -16,6 +16,11 @@ from scipy.spatial.transform import Rotation
 from calib.geometry.first_guess import average_pose, by_orientations, misfit
 from calib.transforms import invert, orthonormal, pose
 
+# of leaving the worst images out, the share that stays, and the poses that a placement needs (our choice)
+ROUNDS, CONSISTENT_SHARE, MIN_POSES = 3, 0.7, 5
+# of a motion that Park and Martin's method uses [rad]
+MAX_TURN = np.pi - 0.1
+
 
 @dataclass(frozen=True, eq=False)
 class Placement:
@@ -52,20 +57,19 @@ def place_robustly(arm: np.ndarray, targets: np.ndarray, lever: float) -> Placem
         "Park-Martin": by_park_martin,
     }
     best: Placement | None = None
-    kept_share = 0.7
-    rounds = 3  # of leaving the worst images out (our choice)
     for name, method in methods.items():
-        keep = np.ones(len(arm), dtype=bool)
-        for _ in range(rounds):
+        consistent = np.ones(len(arm), dtype=bool)
+        for _ in range(ROUNDS):
             try:
-                station, tool = method(arm[keep], targets[keep])
+                station, tool = method(arm[consistent], targets[consistent])
             except np.linalg.LinAlgError:
                 break
-            placement = Placement(name, station, tool, misfit(arm, targets, station, tool, lever))
+            misfits = misfit(arm, targets, station, tool, lever)
+            placement = Placement(name, station, tool, misfits)
             if best is None or placement.error < best.error:
                 best = placement
-            keep = placement.misfit <= np.quantile(placement.misfit, kept_share)
-            if keep.sum() < 5:
+            consistent = misfits <= np.quantile(misfits, CONSISTENT_SHARE)
+            if consistent.sum() < MIN_POSES:
                 break
     if best is None:
         raise np.linalg.LinAlgError("no closed form yields a placement of the target")
@@ -74,35 +78,46 @@ def place_robustly(arm: np.ndarray, targets: np.ndarray, lever: float) -> Placem
 
 def by_li(arm: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return S and X with B_i = S A_i X, from Z B_i = A_i X, Z = S⁻¹: 12 linear equations a pose in 24 unknowns."""
-    m, eye = len(arm), np.eye(3)
-    a, b = arm[:, :3, :3], targets[:, :3, :3]
+    m = len(arm)
+    eye = np.eye(3)
+    R_a, t_a = arm[:, :3, :3], arm[:, :3, 3]
+    R_b, t_b = targets[:, :3, :3], targets[:, :3, 3]
     rows = np.zeros((m, 12, 24))
     # row-major vec: R_A R_X - R_Z R_B = 0;  R_A t_X + t_A - R_Z t_B - t_Z = 0
-    rows[:, :9, :9] = np.einsum("mij,kl->mikjl", a, eye).reshape(m, 9, 9)
-    rows[:, :9, 9:18] = -np.einsum("ij,mlk->mikjl", eye, b).reshape(m, 9, 9)
-    rows[:, 9:, 9:18] = -np.einsum("ij,mk->mijk", eye, targets[:, :3, 3]).reshape(m, 3, 9)
-    rows[:, 9:, 18:21], rows[:, 9:, 21:] = a, -eye
-    target = np.concatenate([np.zeros((m, 9)), -arm[:, :3, 3]], axis=1)
-    flat, constants = rows.reshape(-1, 24), target.ravel()
-    solution = np.linalg.lstsq(flat, constants, rcond=1e-10)[0]
-    x, z = (orthonormal(solution[k : k + 9].reshape(3, 3)) for k in (0, 9))
+    rows[:, :9, :9] = np.einsum("mij,kl->mikjl", R_a, eye).reshape(m, 9, 9)
+    rows[:, :9, 9:18] = -np.einsum("ij,mlk->mikjl", eye, R_b).reshape(m, 9, 9)
+    rows[:, 9:, 9:18] = -np.einsum("ij,mk->mijk", eye, t_b).reshape(m, 3, 9)
+    rows[:, 9:, 18:21] = R_a
+    rows[:, 9:, 21:] = -eye
+    target = np.concatenate([np.zeros((m, 9)), -t_a], axis=1)
+    solution, *_ = np.linalg.lstsq(rows.reshape(-1, 24), target.ravel(), rcond=1e-10)
+    R_x = orthonormal(solution[:9].reshape(3, 3))
+    R_z = orthonormal(solution[9:18].reshape(3, 3))
     # the translations again, with proper rotations
-    translations = constants.reshape(m, 12)[:, 9:] - rows[:, 9:, 9:18] @ z.ravel()
-    shift = np.linalg.lstsq(rows[:, 9:, 18:].reshape(-1, 6), translations.ravel(), rcond=1e-10)[0]
-    return invert(pose(z, shift[3:])), pose(x, shift[:3])
+    translations = target[:, 9:] - rows[:, 9:, 9:18] @ R_z.ravel()
+    translation_rows = rows[:, 9:, 18:].reshape(-1, 6)
+    shift, *_ = np.linalg.lstsq(translation_rows, translations.ravel(), rcond=1e-10)
+    return invert(pose(R_z, shift[3:])), pose(R_x, shift[:3])
 
 
 def by_park_martin(arm: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return S and X; with M = A_i⁻¹ A_j and N = B_i⁻¹ B_j, M X = X N: log R_M = R_X log R_N, then t_X linearly."""
     order = np.argsort(Rotation.from_matrix(arm[:, :3, :3]).as_rotvec()[:, 0])
     first, second = order, np.roll(order, max(1, len(order) // 2))
-    m, n = invert(arm[first]) @ arm[second], invert(targets[first]) @ targets[second]
-    turns = [Rotation.from_matrix(motions[:, :3, :3]).as_rotvec() for motions in (m, n)]
-    small = (np.linalg.norm(turns[0], axis=1) < np.pi - 0.1) & (np.linalg.norm(turns[1], axis=1) < np.pi - 0.1)
+    arm_motion = invert(arm[first]) @ arm[second]
+    target_motion = invert(targets[first]) @ targets[second]
+    arm_turn = Rotation.from_matrix(arm_motion[:, :3, :3]).as_rotvec()
+    target_turn = Rotation.from_matrix(target_motion[:, :3, :3]).as_rotvec()
+    # the logarithm of half a turn has two signs
+    small_arm_turn = np.linalg.norm(arm_turn, axis=1) < MAX_TURN
+    small_target_turn = np.linalg.norm(target_turn, axis=1) < MAX_TURN
+    small = small_arm_turn & small_target_turn
     if small.sum() < 3:
         raise np.linalg.LinAlgError("too few motions")
-    x = orthonormal(turns[0][small].T @ turns[1][small])
-    matrix = (m[:, :3, :3] - np.eye(3)).reshape(-1, 3)
-    target = (np.einsum("ij,mj->mi", x, n[:, :3, 3]) - m[:, :3, 3]).ravel()
-    tool = pose(x, np.linalg.lstsq(matrix, target, rcond=1e-9)[0])
+    R_x = orthonormal(arm_turn[small].T @ target_turn[small])
+    matrix = (arm_motion[:, :3, :3] - np.eye(3)).reshape(-1, 3)
+    turned = np.einsum("ij,mj->mi", R_x, target_motion[:, :3, 3])
+    target = (turned - arm_motion[:, :3, 3]).ravel()
+    t_x, *_ = np.linalg.lstsq(matrix, target, rcond=1e-9)
+    tool = pose(R_x, t_x)
     return average_pose(targets @ invert(arm @ tool)), tool

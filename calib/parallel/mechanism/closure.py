@@ -92,8 +92,11 @@ def links_of(leg: Leg, q: np.ndarray, pose: np.ndarray) -> LegLinks:
     from calib.parallel.mechanism import closure_kernels
 
     count, n = q.shape
-    shapes = ((6, n), (n, leg.held), (leg.held, 6), (leg.held,), (3,))
-    full, inverse, carried, gap, lever = (np.zeros((count, *shape)) for shape in shapes)
+    full = np.zeros((count, 6, n))
+    inverse = np.zeros((count, n, leg.held))
+    carried = np.zeros((count, leg.held, 6))
+    gap = np.zeros((count, leg.held))
+    lever = np.zeros((count, 3))
     bodies, tail = compiled(leg)
     # numba compiles per kind of array
     q = np.require(q, requirements=["C", "W"])
@@ -118,6 +121,14 @@ CLOSED = 1e-10
 BOUND = 0.5
 # reciprocal condition below which a posture is called singular (our choice)
 SINGULAR = 1e-4
+# the same, where Newton's steps fail: that explains it (our choice)
+WEAK = 0.02
+# samples of a record of which the first is reached from home, the others from it
+SPACING = 16
+# of a reading or coordinate between two solutions on the way from home [rad or m] (our choice)
+MAX_STRIDE = 0.25
+# of Newton's method
+MAX_STEPS = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +154,7 @@ class ClosedRobot:
 
         Args:
             readings: (N, n) [rad or m]; a record, whose samples follow one another, is solved faster.
-            near: checked postures that are near, to start from: the new ones are not checked again; None: home.
+            start: checked postures that are near, to start from: the new ones are not checked again; None: home.
 
         Raises:
             NoPosture: for samples out of reach, beyond a singularity, or in one.
@@ -166,11 +177,13 @@ def closed(robot: ParallelRobot) -> ClosedRobot:
     Raises:
         RobotError: where a loop does not close there, home is singular, or the loops leave other freedoms than named.
     """
-    start = Posture(np.concatenate([leg.home for leg in robot.legs])[None], robot.home[None])
+    home_q = np.concatenate([leg.home for leg in robot.legs])
+    start = Posture(home_q[None], robot.home[None])
     # each leg by itself, the platform at rest
     for _ in range(10):
         steps = [-times(link.inverse, link.gap) for link in leg_links(robot, start)]
-        start = Posture(start.q + np.clip(np.concatenate(steps, axis=1), -BOUND, BOUND), start.pose)
+        step = np.clip(np.concatenate(steps, axis=1), -BOUND, BOUND)
+        start = Posture(start.q + step, start.pose)
     gap = max(float(np.abs(link.gap).max()) for link in leg_links(robot, start))
     # what the loops make of the platform's other coordinates
     with suppress(NoPosture, np.linalg.LinAlgError):
@@ -195,7 +208,8 @@ def closed(robot: ParallelRobot) -> ClosedRobot:
     rcond = float(_platform_rcond(opened, rows, rows)[0])
     if rcond < SINGULAR:
         robot.refuse(f"home is singular (type 2): locked actuators do not hold it, rcond {rcond:.1g}")
-    return ClosedRobot(robot, start, minors, frozen(_determinants(opened, links)[0]), fixed)
+    signs = frozen(_determinants(opened, links)[0])
+    return ClosedRobot(robot, start, minors, signs, fixed)
 
 
 def _why_singular(robot: ParallelRobot, home: Posture, leg: Leg) -> str:
@@ -206,15 +220,14 @@ def _why_singular(robot: ParallelRobot, home: Posture, leg: Leg) -> str:
     for _ in range(4):
         turned_q = home.q + rng.uniform(-1.0, 1.0, home.q.shape)
         elsewhere.append(Posture(turned_q, home.pose))
-    if all(
-        float(_leg_rcond(leg_link, leg_link)[0]) < SINGULAR
-        for leg_link in (leg_links(robot, posture_)[k] for posture_ in elsewhere)
-    ):
-        return (
-            f"is singular in all postures: its joints do not move its {leg.end} end in {leg.chain.n} independent "
-            "ways (parallel axes behind a spherical end?)"
-        )
-    return "is singular at home (stretched or folded)"
+    for posture in elsewhere:
+        leg_link = leg_links(robot, posture)[k]
+        if not float(_leg_rcond(leg_link, leg_link)[0]) < SINGULAR:
+            return "is singular at home (stretched or folded)"
+    return (
+        f"is singular in all postures: its joints do not move its {leg.end} end in {leg.chain.n} independent "
+        "ways (parallel axes behind a spherical end?)"
+    )
 
 
 def coordinates_of(mechanism: ClosedRobot, posture: Posture) -> np.ndarray:
@@ -248,13 +261,17 @@ def twists(
     robot = mechanism.robot
     count = len(links[0].gap)
     if mechanism.fixed:
-        return np.broadcast_to(np.eye(6)[:, robot.selected], (count, 6, robot.r)), np.zeros((count, 6))
+        D = np.eye(6)[:, robot.selected]
+        return np.broadcast_to(D, (count, 6, robot.r)), np.zeros((count, 6))
     rows = []
     right = []
     for k, link in enumerate(links):
         across = np.eye(link.gap.shape[1]) - link.jacobian @ link.inverse
         rows.append(across @ link.carried)
-        right.append(np.zeros_like(link.gap) if shifts is None else times(across, shifts[k]))
+        if shifts is None:
+            right.append(np.zeros_like(link.gap))
+        else:
+            right.append(times(across, shifts[k]))
     U, s, Vt = np.linalg.svd(np.concatenate(rows, axis=1), full_matrices=False)
     rank = 6 - robot.r
     free = Vt[:, rank:].transpose(0, 2, 1)
@@ -281,34 +298,29 @@ def _check_postures(mechanism: ClosedRobot, posture: Posture) -> None:
     links = leg_links(mechanism.robot, posture)
     home = leg_links(mechanism.robot, mechanism.home)
     signs = _determinants(mechanism, links)
-    for k, (leg, link, at_home) in enumerate(zip(mechanism.robot.legs, links, home)):
-        weak = _leg_rcond(link, at_home) < SINGULAR
+    other_branch = signs * mechanism.signs < 0
+    for k, (leg, link, home_link) in enumerate(zip(mechanism.robot.legs, links, home)):
+        weak = _leg_rcond(link, home_link) < SINGULAR
         _refuse(mechanism, posture, weak, f"{leg.name} is singular (type 1: stretched or folded)")
-        _refuse(
-            mechanism, posture, signs[:, k] * mechanism.signs[k] < 0, f"{leg.name} is on another branch than at home"
-        )
-    weak = _platform_rcond(mechanism, _reading_rows(mechanism, links), _reading_rows(mechanism, home)) < SINGULAR
+        _refuse(mechanism, posture, other_branch[:, k], f"{leg.name} is on another branch than at home")
+    rows, home_rows = _reading_rows(mechanism, links), _reading_rows(mechanism, home)
+    weak = _platform_rcond(mechanism, rows, home_rows) < SINGULAR
     _refuse(mechanism, posture, weak, "the platform is singular (type 2: locked actuators do not hold it)")
-    _refuse(
-        mechanism,
-        posture,
-        signs[:, -1] * mechanism.signs[-1] < 0,
-        "the platform is beyond a type 2 singularity from home",
-    )
+    _refuse(mechanism, posture, other_branch[:, -1], "the platform is beyond a type 2 singularity from home")
 
 
 def _refuse(mechanism: ClosedRobot, posture: Posture, bad: np.ndarray, message: str) -> None:
-    if bad.any():
-        indices = np.flatnonzero(bad)
-        count_text = f" ({len(indices)} of {len(bad)} samples)" if len(indices) > 1 else ""
-        raise NoPosture(
-            f"sample {indices[0] + 1}, platform at {_where(mechanism, posture[indices[:1]])}: {message}{count_text}",
-            indices.tolist(),
-        )
+    if not bad.any():
+        return
+    indices = np.flatnonzero(bad)
+    if len(indices) > 1:
+        message += f" ({len(indices)} of {len(bad)} samples)"
+    location = _where(mechanism, posture[indices[:1]])
+    raise NoPosture(f"sample {indices[0] + 1}, platform at {location}: {message}", indices.tolist())
 
 
 def _where(mechanism: ClosedRobot, posture: Posture) -> str:
-    values = coordinates_of(mechanism, posture)[0]
+    (values,) = coordinates_of(mechanism, posture)
     return ", ".join(f"{name} = {value:.4g}" for name, value in zip(mechanism.robot.freedom, values))
 
 
@@ -320,19 +332,18 @@ def _reached(
         return mechanism.home[:0]
     if start is not None:
         return _newton(mechanism, start, goals, aim)
-    # samples of a record of which the first is reached from home, the others from it
-    spacing = 16
-    # of a reading or coordinate between two solutions on the way from home [rad or m] (our choice)
-    max_stride = 0.25
-    if len(goals) > 2 * spacing and np.abs(np.diff(goals, axis=0)).max() < max_stride / spacing:
-        first = _reached(mechanism, goals[::spacing], coordinates, aim, None)
-        nearest = np.minimum((np.arange(len(goals)) + spacing // 2) // spacing, len(first) - 1)
+    is_record = len(goals) > 2 * SPACING and np.abs(np.diff(goals, axis=0)).max() < MAX_STRIDE / SPACING
+    if is_record:
+        first = _reached(mechanism, goals[::SPACING], coordinates, aim, None)
+        nearest = (np.arange(len(goals)) + SPACING // 2) // SPACING
+        nearest = np.minimum(nearest, len(first) - 1)
         posture = _newton(mechanism, first[nearest], goals, aim)
     else:
-        count = max(1, int(np.ceil(np.abs(goals - coordinates).max() / max_stride)))
+        travel = goals - coordinates
+        count = max(1, int(np.ceil(np.abs(travel).max() / MAX_STRIDE)))
         posture = mechanism.home[np.zeros(len(goals), dtype=int)]
         for share in np.arange(1, count) / count:
-            posture = _newton(mechanism, posture, coordinates + share * (goals - coordinates), aim, rough=True)
+            posture = _newton(mechanism, posture, coordinates + share * travel, aim, rough=True)
         posture = _newton(mechanism, posture, goals, aim)
     _check_postures(mechanism, posture)
     return posture
@@ -343,13 +354,12 @@ def _newton(mechanism: ClosedRobot, start: Posture, goals: np.ndarray, aim: _Aim
     q = np.array(start.q)
     pose = np.array(start.pose)
     open_rows = np.arange(len(q))
-    # Newton steps
-    max_steps = 60
-    for _ in range(2 if rough else max_steps):
+    for _ in range(2 if rough else MAX_STEPS):
         posture = Posture(q[open_rows], pose[open_rows])
         links = leg_links(mechanism.robot, posture)
         D, t = twists(mechanism, links, [link.gap for link in links])
-        twist = t + times(D, aim(mechanism, links, D, t, posture, goals[open_rows]))
+        independent = aim(mechanism, links, D, t, posture, goals[open_rows])
+        twist = t + times(D, independent)
         leg_steps = [times(link.inverse, times(link.carried, twist) - link.gap) for link in links]
         steps = np.concatenate(leg_steps, axis=1)
         size = np.maximum(np.abs(steps).max(axis=1), np.abs(twist).max(axis=1))
@@ -357,7 +367,8 @@ def _newton(mechanism: ClosedRobot, start: Posture, goals: np.ndarray, aim: _Aim
         q[open_rows] += share * steps
         pose[open_rows] = _moved(posture.pose, share * twist)
         gap = np.max([np.abs(link.gap).max(axis=1) for link in links], axis=0)
-        open_rows = open_rows[~(np.maximum(size, gap) < CLOSED)]
+        is_closed = np.maximum(size, gap) < CLOSED
+        open_rows = open_rows[~is_closed]
         if not len(open_rows):
             break
     if len(open_rows) and not rough:
@@ -365,28 +376,28 @@ def _newton(mechanism: ClosedRobot, start: Posture, goals: np.ndarray, aim: _Aim
     return Posture(q, pose)
 
 
-def _tell_unreached(mechanism: ClosedRobot, posture: Posture, unreached: np.ndarray, max_rcond: float = 0.02) -> None:
-    # max_rcond: the same, where Newton's steps fail: that explains it (our choice)
+def _tell_unreached(mechanism: ClosedRobot, posture: Posture, unreached: np.ndarray) -> None:
+    """Raise an error for samples whose loops Newton's method does not close, with the likely reason."""
     first = posture[unreached[:1]]
-    at_home = leg_links(mechanism.robot, mechanism.home)
-    links = dict(zip((leg.name for leg in mechanism.robot.legs), leg_links(mechanism.robot, first)))
-    worst = max(links, key=lambda name: float(np.abs(links[name].gap).max()))
-    gap = 1e3 * float(np.abs(links[worst].gap).max())
-    weak = []
-    for (name, link), home in zip(links.items(), at_home):
-        if float(_leg_rcond(link, home)[0]) < max_rcond:
-            weak.append(name)
-    if gap > 1.0:
-        reason = f"{worst} stays {gap:.3g} mm from its attachment: out of reach"
-    else:
-        if weak:
-            reason = f"{weak[0]} is stretched or folded: a singularity (type 1), the end of its reach"
-        else:
-            reason = "Newton's method does not converge: singularity (type 2) or contradictory readings"
-    count_text = f" ({len(unreached)} of {len(posture)} samples)" if len(unreached) > 1 else ""
+    home = leg_links(mechanism.robot, mechanism.home)
+    largest_gap, farthest_leg, weak_leg = -np.inf, "", ""
+    for leg, link, home_link in zip(mechanism.robot.legs, leg_links(mechanism.robot, first), home):
+        gap = float(np.abs(link.gap).max())
+        if gap > largest_gap:
+            largest_gap, farthest_leg = gap, leg.name
+        if not weak_leg and float(_leg_rcond(link, home_link)[0]) < WEAK:
+            weak_leg = leg.name
+    gap_mm = 1e3 * largest_gap
+    reason = "Newton's method does not converge: singularity (type 2) or contradictory readings"
+    if gap_mm > 1.0:
+        reason = f"{farthest_leg} stays {gap_mm:.3g} mm from its attachment: out of reach"
+    elif weak_leg:
+        reason = f"{weak_leg} is stretched or folded: a singularity (type 1), the end of its reach"
+    if len(unreached) > 1:
+        reason += f" ({len(unreached)} of {len(posture)} samples)"
     raise NoPosture(
         f"sample {unreached[0] + 1}: the loops of '{mechanism.robot.name}' cannot be closed (last try: platform at "
-        f"{_where(mechanism, first)}): {reason}{count_text}; check units, zeros and order of the encoders",
+        f"{_where(mechanism, first)}): {reason}; check units, zeros and order of the encoders",
         unreached.tolist(),
     )
 
@@ -395,10 +406,12 @@ def _from_readings(
     mechanism: ClosedRobot, links: Sequence[LegLinks], D: np.ndarray, t: np.ndarray, posture: Posture, goals: np.ndarray
 ) -> np.ndarray:
     """Return the independent twist components (N, r) that bring the encoder readings closest to their targets."""
-    A = np.concatenate([link.inverse @ link.carried for link in links], axis=1)
-    steps = np.concatenate([times(link.inverse, link.gap) for link in links], axis=1) - times(A, t)
+    by_twist = np.concatenate([link.inverse @ link.carried for link in links], axis=1)
+    gap_steps = np.concatenate([times(link.inverse, link.gap) for link in links], axis=1)
+    steps = gap_steps - times(by_twist, t)
     actuated = mechanism.robot.actuated
-    return times(pseudo_inverse(A[:, actuated] @ D), goals - posture.q[:, actuated] + steps[:, actuated])
+    errors = goals - posture.q[:, actuated] + steps[:, actuated]
+    return times(pseudo_inverse(by_twist[:, actuated] @ D), errors)
 
 
 def _from_coordinates(
@@ -425,7 +438,8 @@ def _leg_rcond(links: LegLinks, home: LegLinks) -> np.ndarray:
     travel = np.linalg.norm(home.full[0, :3], axis=0)
     turns = np.linalg.norm(home.full[0, 3:], axis=0) > 0.5
     length = max(float(travel[turns].max(initial=0.0)), 1e-6)
-    row_length = np.where(np.arange(links.jacobian.shape[1]) < 3, length, 1.0)
+    is_position = np.arange(links.jacobian.shape[1]) < 3
+    row_length = np.where(is_position, length, 1.0)
     by_row = row_length[:, None] / np.where(turns, 1.0, length)
     return _rcond(links.jacobian / by_row, links.inverse * by_row.T)
 
@@ -434,8 +448,10 @@ def _platform_rcond(mechanism: ClosedRobot, rows: np.ndarray, home: np.ndarray) 
     """Return reciprocal conditions (N,) of J_p^inv; translations and rotations are scaled by their maxima at home."""
     turns = mechanism.robot.selected > 2
     size = np.linalg.norm(home[0], axis=0)
-    scale = np.where(turns, size[turns].max(initial=0.0), size[~turns].max(initial=0.0))
-    scaled = rows / scale / np.linalg.norm(home[0] / scale, axis=1)[:, None]
+    turn_size, shift_size = size[turns].max(initial=0.0), size[~turns].max(initial=0.0)
+    scale = np.where(turns, turn_size, shift_size)
+    row_size = np.linalg.norm(home[0] / scale, axis=1)
+    scaled = rows / scale / row_size[:, None]
     return _rcond(scaled, pseudo_inverse(scaled))
 
 
@@ -477,17 +493,19 @@ def _check_freedom(robot: ParallelRobot, home: Posture, links: Sequence[LegLinks
         for link in links:
             projection = np.eye(link.gap.shape[1]) - link.jacobian @ link.inverse
             rows.append(projection @ link.carried)
-        values = np.linalg.svd(np.concatenate(rows, axis=1)[0])
-        remaining = 6 - int((values[1] > 1e-9 * max(1.0, values[1][0])).sum())
+        constraints = np.concatenate(rows, axis=1)[0]
+        _, singular, axes = np.linalg.svd(constraints)
+        remaining = 6 - int((singular > 1e-9 * max(1.0, singular[0])).sum())
+        free_motions = axes[6 - remaining :]
         if remaining != robot.r:
             robot.refuse(
                 f"its platform has {remaining} freedoms, but the key 'freedom' lists {robot.r} "
-                f"({', '.join(robot.freedom)}); its free motions are {_motions(values[2][6 - remaining :])}"
+                f"({', '.join(robot.freedom)}); its free motions are {_motions(free_motions)}"
             )
-        if np.linalg.cond(values[2][6 - remaining :, robot.selected]) > 1e8:
-            motions = _motions(values[2][6 - remaining :])
+        if np.linalg.cond(free_motions[:, robot.selected]) > 1e8:
+            motions = _motions(free_motions)
             robot.refuse(f"the platform can move in {motions}; freedom lists {', '.join(robot.freedom)}")
-        fixed = fixed and float(np.abs(np.concatenate(rows, axis=1)[0] @ freedoms).max()) < 1e-9
+        fixed = fixed and float(np.abs(constraints @ freedoms).max()) < 1e-9
         if trial == 3:
             break
         # a little away from home, where a special posture does not hide what the loops leave

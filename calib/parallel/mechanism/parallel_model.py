@@ -43,6 +43,7 @@ def wrench_regressor(pose: np.ndarray, twist: np.ndarray, change: np.ndarray, gr
         gravity: (3,) [m/s²].
     """
     R = pose[:, :3, :3]
+    # acceleration, angular velocity and its derivative in the platform's axes
     a = np.einsum("nji,nj->ni", R, change[:, :3] - gravity)
     w = np.einsum("nji,nj->ni", R, twist[:, 3:])
     b = np.einsum("nji,nj->ni", R, change[:, 3:])
@@ -116,8 +117,9 @@ class ParallelModel:
         if self.identical_legs:
             kinds = [joint.kind for joint in legs[0].chain.joints]
             for leg in legs:
-                alike = leg.bodies == legs[0].bodies and [joint.kind for joint in leg.chain.joints] == kinds
-                require(alike, f"identical_legs: {leg.name} is built unlike {legs[0].name}", UsageError)
+                leg_kinds = [joint.kind for joint in leg.chain.joints]
+                if leg.bodies != legs[0].bodies or leg_kinds != kinds:
+                    raise UsageError(f"identical_legs: {leg.name} is built unlike {legs[0].name}")
         doubled = sorted({name for name in self.names if self.names.count(name) > 1})
         if doubled:
             raise CalibError(f"parameter '{doubled[0]}' occurs twice; give the payload or term another name")
@@ -262,12 +264,15 @@ class ParallelModel:
     ) -> np.ndarray:
         """Return the torques, forces or power (N, rows) for parameters (p,), computed without the regressor."""
         motion = self.moved(q, v, a)
-        return self.on_rows(self.platform_force(values, motion, carried)[:, :, None], motion)[:, :, 0]
+        force = self.platform_force(values, motion, carried)
+        return self.on_rows(force[:, :, None], motion)[:, :, 0]
 
     def moved(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, start: Posture | None = None) -> LoopMotion:
-        """Return the whole robot's motion from the encoders' q, v, a (N, n); `near`: postures to start from."""
+        """Return the whole robot's motion from the encoders' q, v, a (N, n); `start`: postures near the new ones."""
         posture = self.mechanism.locate(q, start)
-        return of_readings(self.mechanism, posture, np.asarray(v, dtype=float), np.asarray(a, dtype=float))
+        v = np.asarray(v, dtype=float)
+        a = np.asarray(a, dtype=float)
+        return of_readings(self.mechanism, posture, v, a)
 
     def platform_regressor(self, motion: LoopMotion, carried: Collection[str] | None = None) -> np.ndarray:
         """Return the regressor W (N, r, p) in platform coordinates, stored in the order (p, r, N)."""
@@ -275,11 +280,13 @@ class ParallelModel:
         J = motion.jacobians
         out = np.zeros((self._bodies + len(self.terms), robot.r, len(motion.v)))
         for bodies, joints, columns in self.legs:
-            W = rigid_body.regressor(bodies, motion.posture.q[:, joints], motion.v[:, joints], motion.a[:, joints])
+            q, v, a = motion.posture.q[:, joints], motion.v[:, joints], motion.a[:, joints]
+            W = rigid_body.regressor(bodies, q, v, a)
             W = W[:, :, : columns.stop - columns.start]
             out[columns] = np.einsum("njr,njc->crn", J.joints[:, joints], W, optimize=True)
         platform = wrench_regressor(motion.posture.pose, motion.twist, motion.change, robot.gravity)
-        self._fill_platform(out, (J.platform.transpose(0, 2, 1) @ platform).transpose(2, 1, 0), carried)
+        on_coordinates = J.platform.transpose(0, 2, 1) @ platform
+        self._fill_platform(out, on_coordinates.transpose(2, 1, 0), carried)
         motions = [motion.posture.q.T, motion.v.T, motion.a.T, None]
         for k, term in enumerate(self.terms):
             for joint, column in term.acting(motions, np.zeros((0, len(motion.v)))):
@@ -294,8 +301,11 @@ class ParallelModel:
         J = motion.jacobians
         tree = self.tree_torque(values, motion)
         fixed = self.platform_parameters(values, carried)
-        wrench = wrench_regressor(motion.posture.pose, motion.twist, motion.change, robot.gravity) @ fixed
-        return np.einsum("ntr,nt->nr", J.joints, tree) + np.einsum("nkr,nk->nr", J.platform, wrench)
+        regressor = wrench_regressor(motion.posture.pose, motion.twist, motion.change, robot.gravity)
+        wrench = regressor @ fixed
+        of_tree = np.einsum("ntr,nt->nr", J.joints, tree)
+        of_platform = np.einsum("nkr,nk->nr", J.platform, wrench)
+        return of_tree + of_platform
 
     def actuator_torques(
         self, values: np.ndarray, motion: LoopMotion, carried: Collection[str] | None = None
@@ -311,7 +321,8 @@ class ParallelModel:
         a = motion.a
         torques = []
         for (bodies, joints, _), parameters in zip(self.legs, self.leg_parameters(values)):
-            torques.append(rigid_body.inverse_dynamics(bodies, parameters, q[:, joints], v[:, joints], a[:, joints]))
+            states = q[:, joints], v[:, joints], a[:, joints]
+            torques.append(rigid_body.inverse_dynamics(bodies, parameters, *states))
         result = np.concatenate(torques, axis=1)
         no_payloads = np.zeros((0, len(result)))
         for term, value in zip(self.terms, self.spread(values)[self._bodies :]):
@@ -387,8 +398,9 @@ class ParallelModel:
         drive = range(self._bodies, self._bodies + len(self.terms))
         first = range(platform, platform + 10)
         payloads = range(platform + 10, self._bodies)
-        order_ = [*first, *ranks["moments"], *ranks["inertias"], *drive, *ranks["late"], *payloads]
-        return np.array(list(dict.fromkeys(self.owners[order_])), dtype=int)
+        columns = [*first, *ranks["moments"], *ranks["inertias"], *drive, *ranks["late"], *payloads]
+        distinct = dict.fromkeys(self.owners[columns])
+        return np.array(list(distinct), dtype=int)
 
     def plant(self, values: np.ndarray, terms: Sequence[DriveTerm] = ()) -> Any:
         """Return the robot to simulate with values of its parameters and of further terms of the actuated joints."""
@@ -417,8 +429,10 @@ class ParallelModel:
     ) -> States:
         """Draw random states: the platform uniform in its box, its twist and the twist's derivative within ±3."""
         robot = self.mechanism.robot
-        posture = self.mechanism.place(rng.uniform(robot.lower, robot.upper, (count, robot.r)))
-        motion = of_platform(self.mechanism, posture, *rng.uniform(-RATE, RATE, (2, count, robot.r)))
+        coordinates = rng.uniform(robot.lower, robot.upper, (count, robot.r))
+        posture = self.mechanism.place(coordinates)
+        rate, change = rng.uniform(-RATE, RATE, (2, count, robot.r))
+        motion = of_platform(self.mechanism, posture, rate, change)
         actuated = robot.actuated
         return States(posture.q[:, actuated], motion.v[:, actuated], motion.a[:, actuated])
 
@@ -545,7 +559,8 @@ def _twist_of(mechanism: ClosedRobot, x: np.ndarray, v: np.ndarray, a: np.ndarra
     pitch = rates[:, 1:2] * axes[:, :, 1]
     roll = rates[:, :1] * axes[:, :, 0]
     full[1, :, 3:] = yaw + pitch + roll
-    full[2, :, 3:] = np.einsum("nij,nj->ni", axes, changes) + np.cross(yaw, pitch) + np.cross(yaw + pitch, roll)
+    by_changes = np.einsum("nij,nj->ni", axes, changes)
+    full[2, :, 3:] = by_changes + np.cross(yaw, pitch) + np.cross(yaw + pitch, roll)
     return full[1][:, selected], full[2][:, selected]
 
 

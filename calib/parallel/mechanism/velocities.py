@@ -170,13 +170,16 @@ def distributed(
     Args:
         preload: c, (N, n - r) or one for all [N m or N]; 0: the torques of least norm.
     """
-    minimum = np.einsum("nar,nr->na", np.linalg.pinv(jacobians.readings).transpose(0, 2, 1), forces)
+    distribution = np.linalg.pinv(jacobians.readings).transpose(0, 2, 1)
+    minimum = np.einsum("nar,nr->na", distribution, forces)
     if not mechanism.robot.redundant:
         return minimum
     N = preload_directions(mechanism, jacobians)
-    return minimum + np.einsum("nac,nc->na", N, np.broadcast_to(preload, (len(N), N.shape[2])))
+    preloads = np.broadcast_to(preload, (len(N), N.shape[2]))
+    return minimum + np.einsum("nac,nc->na", N, preloads)
 
 
 def _left_null(A: np.ndarray, rank: int) -> np.ndarray:
     """Return an orthonormal basis (N, n, n - r) of the left null space of A (N, n, r)."""
-    return np.linalg.svd(A)[0][:, :, rank:]
+    U, _, _ = np.linalg.svd(A)
+    return U[:, :, rank:]
