@@ -49,7 +49,10 @@ from calib.records import frozen
 
 MIN_STANDSTILL = 0.05  # [s] that a joint stands; shorter ones are reversals (our choice)
 MAX_MEDIAN = 0.25  # of the width of Coulomb's sign; of a speed that passes evenly through zero it is 0.5 (our choice)
-CLEARLY_LESS = 0.85  # of the error in motion on left-out time, for which standing rows count as any others (our choice)
+# Of the error in motion on left-out time, for which standing rows count as any others (our choice). What asks for it in
+# the open recordings is at 0.63 and 0.79 (TIAGo), what is better without at 0.87 (UR10e), 0.96 (TIAGo) and above 1:
+# with any one robot left out the others allow 0.85.
+CLEARLY_LESS = 0.85
 TRAVELS = (0.0, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05)  # over which friction at rest may fade [rad or m] (our choice)
 BREAKAWAY_ROUNDS = 3  # of a fit and the travel that its residuals ask for
 VARIANCE_ROUNDS = 20

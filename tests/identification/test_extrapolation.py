@@ -73,6 +73,15 @@ def test_a_coupling_is_found_and_written_and_none_where_there_is_none():
     assert "coupling" not in alone.friction.chosen and drive_table(alone.dynamics).pairs == ()
 
 
+def test_no_coupling_is_found_in_a_motion_of_one_frequency_that_does_not_tell_it_apart():
+    """Friction that the standard model lacks is explained by other joints' motion there, but not elsewhere."""
+    case = planted.case("log", 0, noise=0.05, harmonics=1)
+    v = case.motion.v
+    richer = (8.0 * np.sqrt(np.abs(v)) + 6.0 * np.exp(-np.abs(v) / 0.1)) * np.tanh(v / 0.01)
+    found = identify(planted.arm(), [replace(case, target=case.target + richer)], replace(PLAIN, friction="auto"))
+    assert "coupling" not in found.friction.chosen and len(found.friction.steps) > 1
+
+
 def test_a_joint_that_never_reverses_has_friction_like_the_others_and_no_offset():
     """Coulomb friction in proportion to the torque limits: joint 1's constant torque is its friction, not an offset."""
     arm = planted.arm()
