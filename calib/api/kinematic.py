@@ -23,7 +23,7 @@ from calib.procedure.kinematic_stage import fit, folder, inputs, selection
 from calib.procedure.kinematic_stage.inputs import gravity_of
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, FitSettings, SelectionSettings
 from calib.procedure.measuring import prediction
-from calib.procedure.measuring.run import write_run
+from calib.procedure.measuring.measuring_run import write_run
 from calib.procedure.robot_kinds import Mechanism, stage_of
 from calib.records import as_subclass, plain, shaped
 from calib.result_kinds import BY_NAME
@@ -129,7 +129,7 @@ class GeometryFit(ChartedResult, Judged, fit.Outcome):
     @property
     def residuals(self) -> DataFrame:
         """Residuals of every row, fitted or unseen, with weight and expected error, as a pandas DataFrame."""
-        from calib.procedure.kinematic_stage.tables import residuals
+        from calib.procedure.kinematic_stage.fit_tables import residuals
 
         return data_frame(*residuals(self))
 
@@ -202,7 +202,7 @@ class GeometryFit(ChartedResult, Judged, fit.Outcome):
 
     def to_dataframe(self) -> DataFrame:
         """Return the fitted parameters as a pandas DataFrame: name, unit, nominal, value, sigma, RSD [%]."""
-        from calib.procedure.kinematic_stage.tables import HEADER, estimate_table
+        from calib.procedure.kinematic_stage.fit_tables import HEADER, estimate_table
 
         return data_frame(estimate_table(self.selection.fit, self.selection.nominal.cell).rows(), HEADER)
 

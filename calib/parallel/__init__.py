@@ -50,7 +50,7 @@ def drive_gains(
     known: Mapping[str, float],
     reference: int | None,
 ) -> DriveGains:
-    """Return the drive gains of a parallel robot; see `calib.parallel.gains.drive_gains`."""
-    from calib.parallel import gains
+    """Return the drive gains of a parallel robot; see `calib.parallel.actuator_gains.drive_gains`."""
+    from calib.parallel import actuator_gains
 
-    return gains.drive_gains(robot, cases, settings, known, reference)
+    return actuator_gains.drive_gains(robot, cases, settings, known, reference)

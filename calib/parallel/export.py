@@ -47,7 +47,7 @@ from calib.folders import (
 )
 from calib.identification.model_file import MODEL, refuse_currents
 from calib.identification.physical_consistency import information
-from calib.identification.physical_consistency.problem import find_prior_bodies
+from calib.identification.physical_consistency.consistency_problem import find_prior_bodies
 from calib.identification.physical_consistency.solve import PossibleBodies, find_possible
 from calib.identification.prediction import Dynamics
 from calib.identification.prior import RADIUS

@@ -29,9 +29,9 @@ from calib.procedure.robot_kinds import joints_of
 from calib.records import shaped
 from calib.robot.chain import Chain
 from calib.trajectories.setpoints import joined
-from calib.trajectories.timing.limits import TimingLimits
 from calib.trajectories.timing.path import Path as JointPath
 from calib.trajectories.timing.path import check_within, spline, through
+from calib.trajectories.timing.path_limits import TimingLimits
 from calib.trajectories.timing.profile import track
 from calib.trajectories.timing.time_scaling import time_optimal
 

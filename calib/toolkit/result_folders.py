@@ -9,12 +9,12 @@ from calib.procedure.export.delivery import prediction
 from calib.procedure.export.geometry import read as read_exported
 from calib.procedure.export.geometry import results as geometry_results
 from calib.procedure.findings import LEVELS, Note, Verdict, as_notes, limit, lines_of, notes_of, sentence, settle
+from calib.procedure.kinematic_stage.fit_tables import read_covariance
 from calib.procedure.kinematic_stage.folder import IN_SESSION, URDF, VALIDATED, FitFolder, ValidationFolder
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.procedure.kinematic_stage.inputs import read_file as read_measured_file
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics, ValidationMetrics
 from calib.procedure.kinematic_stage.settings import FitSettings
-from calib.procedure.kinematic_stage.tables import read_covariance
 from calib.procedure.robot_kinds import joints_of, stage_of
 from calib.results.registry import drawn, open_result
 from calib.results.result import Result, StoredResult

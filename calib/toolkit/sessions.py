@@ -20,7 +20,7 @@ from calib.procedure.session.folder import (
     read_state,
 )
 from calib.procedure.session.geometry_steps import chain_of, clear_staging, notes_on, read_measured
-from calib.procedure.session.results import folders_of, position_errors, torque_error
+from calib.procedure.session.session_results import folders_of, position_errors, torque_error
 from calib.procedure.session.steps import DONE, KEPT, WAITING, run_next, steps_of
 from calib.procedure.session.steps import State as StepState
 from calib.procedure.session.steps import find as find_step

@@ -4,7 +4,7 @@
     τ = J⁺ᵀ w + N c,    within ±τ_max, held over a period
 
 M̂, ŵ and J⁺ = (J_p^inv)⁺ are the controller's, along the reference x_r; c is its preload; q̇ and q̇_r are backward
-differences. The robot is simulated by `calib.parallel.mechanism.simulation`.
+differences. The robot is simulated by `calib.parallel.mechanism.mechanism_simulation`.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from calib.dynamics import rigid_body
 from calib.identification.closed_loop.controllers import Reference
 from calib.identification.closed_loop.simulation import Sensing, added_inertia
 from calib.identification.loop import LoopController
+from calib.parallel.mechanism.mechanism_simulation import ParallelPlant
 from calib.parallel.mechanism.parallel_model import ParallelModel, along, wrench_regressor
-from calib.parallel.mechanism.simulation import ParallelPlant
 from calib.parallel.mechanism.velocities import LoopMotion
 
 

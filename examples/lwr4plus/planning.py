@@ -32,9 +32,9 @@ from calib.robot import description, library
 from calib.robot.chain import Chain, random_joints
 from calib.simulation.known_robots import truth
 from calib.trajectories.errors import BadInput
-from calib.trajectories.timing.limits import TimingLimits
 from calib.trajectories.timing.path import Path as JointPath
 from calib.trajectories.timing.path import check_within, spline
+from calib.trajectories.timing.path_limits import TimingLimits
 from calib.trajectories.timing.profile import dense
 from calib.trajectories.timing.shape import shorten
 from calib.trajectories.timing.time_scaling import Timing, time_optimal

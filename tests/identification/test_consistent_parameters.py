@@ -13,8 +13,13 @@ from calib.dynamics.idim import IdentificationModel, from_chain
 from calib.errors import UsageError
 from calib.estimation.estimate import whitened
 from calib.identification.physical_consistency import solve
+from calib.identification.physical_consistency.consistency_problem import (
+    BodyCost,
+    find_prior_bodies,
+    make_problem,
+    nearest,
+)
 from calib.identification.physical_consistency.information import Information
-from calib.identification.physical_consistency.problem import BodyCost, find_prior_bodies, make_problem, nearest
 from calib.identification.prediction import Dynamics
 from calib.robot.chain import Chain, Element, Joint
 

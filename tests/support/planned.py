@@ -18,7 +18,7 @@ from calib.identification.prediction import Dynamics
 from calib.robot import description
 from calib.robot.library import load
 from calib.simulation.known_robots import truth
-from calib.trajectories.timing.limits import TimingLimits
+from calib.trajectories.timing.path_limits import TimingLimits
 
 CHAIN = load("lwr4plus")
 WAYPOINTS = np.array(

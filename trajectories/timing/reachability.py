@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import BadInput, NothingFeasible
-from ..timing.limits import Law, TimingLimits
+from ..timing.path_limits import Law, TimingLimits
 from ..timing.path import Path
 from ..timing.profile import Profile
 

@@ -10,7 +10,7 @@ Fv, Fc (1×1 matrices of the same kind), the parameters are
 with the log-det divergence D (Lee, Wensing & Park 2020): convex, the same in any frame and any unit, and infinite at
 the border, so every body is possible with a margin. A plain Euclidean distance would need a weight between kg and kg
 m²; that in the coordinates of P_i⁰ does not, and may be asked for
-(`calib.identification.physical_consistency.problem`).
+(`calib.identification.physical_consistency.consistency_problem`).
 
 How much the CAD counts. exp(-½ γ D) is, up to its norm, the Wishart density of a 4×4 matrix with mode P⁰ and γ + 5
 degrees of freedom (our observation), so γ has a marginal likelihood,
@@ -51,8 +51,7 @@ from scipy.special import multigammaln  # type: ignore[attr-defined]
 from calib.dynamics import pseudo_inertia
 from calib.dynamics.idim import IdentificationModel
 from calib.errors import NotConverged, UsageError, one_of
-from calib.identification.physical_consistency.information import Information, of
-from calib.identification.physical_consistency.problem import (
+from calib.identification.physical_consistency.consistency_problem import (
     DRIVE,
     BodyCost,
     PriorBodies,
@@ -61,6 +60,7 @@ from calib.identification.physical_consistency.problem import (
     make_problem,
     nearest,
 )
+from calib.identification.physical_consistency.information import Information, of
 from calib.identification.prediction import Dynamics
 from calib.records import Frozen
 from calib.robot.chain import Chain

@@ -405,7 +405,7 @@ class ParallelModel:
     def plant(self, values: np.ndarray, terms: Sequence[DriveTerm] = ()) -> Any:
         """Return the robot to simulate with values of its parameters and of further terms of the actuated joints."""
         # stands on this module
-        from calib.parallel.mechanism.simulation import ParallelPlant
+        from calib.parallel.mechanism.mechanism_simulation import ParallelPlant
 
         actuated_terms = []
         for term in terms:

@@ -25,7 +25,7 @@ from calib.identification.link_motion import with_link_motion
 from calib.identification.registry import METHODS
 from calib.identification.rows import Case, case_names, make_case
 from calib.identification.settings import IdentificationSettings
-from calib.procedure.dynamic_stage.gains import FoundGains, find_gains
+from calib.procedure.dynamic_stage.recorded_gains import FoundGains, find_gains
 from calib.procedure.robot_kinds import Mechanism, joints_of
 from calib.records import FieldValues, frozen
 from calib.robot.calibrated import CalibratedChain

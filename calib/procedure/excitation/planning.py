@@ -41,10 +41,10 @@ from calib.robot.chain import Chain, joint_kinds
 from calib.robot.kinematics import forward, tip_jacobian
 from calib.trajectories.basis import SampledMotion
 from calib.trajectories.setpoints import Setpoints, joined, slowed
-from calib.trajectories.timing.limits import TimingLimits
 from calib.trajectories.timing.lines import line
 from calib.trajectories.timing.path import Path as JointPath
 from calib.trajectories.timing.path import check_within, checked, spline
+from calib.trajectories.timing.path_limits import TimingLimits
 from calib.trajectories.timing.profile import track
 from calib.trajectories.timing.shape import Shaped, shorten
 from calib.trajectories.timing.time_scaling import Timing, time_optimal

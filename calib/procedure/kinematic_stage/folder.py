@@ -21,7 +21,7 @@ from calib.geometry.first_guess import install
 from calib.geometry.fit import polish_frames
 from calib.geometry.weighing import Settings
 from calib.procedure.findings import lines_of
-from calib.procedure.kinematic_stage import tables
+from calib.procedure.kinematic_stage import fit_tables
 from calib.procedure.kinematic_stage.fit import Outcome
 from calib.procedure.kinematic_stage.inputs import Inputs, plain_reference
 from calib.procedure.kinematic_stage.metrics import SCHEMA, Findings, FitMetrics, ValidationMetrics
@@ -107,7 +107,7 @@ class FitFolder:
         expected = None
         if findings.discrepancy is not None:
             fitted_q = np.concatenate([block.q for block in inputs.fit])
-            free, covariance = tables.read_covariance(self.path, calibrated_cell)
+            free, covariance = fit_tables.read_covariance(self.path, calibrated_cell)
             expected = ErrorModel(calibrated_cell, free, covariance, fitted_q, findings.discrepancy)
         start = install(inputs.chain, inputs.fit, inputs.known)
         weighing = replace(settings, loss=findings.loss or settings.loss)
@@ -141,7 +141,7 @@ class ValidationFolder:
 
     def write(self, assessment: Assessment, inputs: Inputs, rows: Sequence[object]) -> ValidationMetrics:
         """Write errors, rows and, last, the metrics; return the metrics."""
-        tables.write_errors(self.errors, inputs.chain, assessment.validation)
+        fit_tables.write_errors(self.errors, inputs.chain, assessment.validation)
         files.write_json(self.rows, rows)
         files.write_json(self.judged, assessment.record)
         return assessment.record
@@ -217,10 +217,10 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
             urdf_write.edit_file(source, folder / name, chain, geometry)
         else:
             files.write(folder / name, urdf_write.write_new(geometry))
-    estimate = tables.estimate_table(fit, outcome.selection.nominal.cell)
-    files.write_table(folder / ESTIMATE, tables.HEADER, estimate.rows())
+    estimate = fit_tables.estimate_table(fit, outcome.selection.nominal.cell)
+    files.write_table(folder / ESTIMATE, fit_tables.HEADER, estimate.rows())
     folders.write_covariance(folder / COVARIANCE, estimate.names, estimate.covariance)
-    rows, header = tables.residuals(outcome)
+    rows, header = fit_tables.residuals(outcome)
     files.write_table(folder / RESIDUALS, header, rows)
     files.write_json(folder / METRICS, metrics(outcome))
 

@@ -26,10 +26,10 @@ from calib.poses.space import SearchSpace, is_feasible
 from calib.procedure.kinematic_stage.inputs import load_robot
 from calib.procedure.kinematic_stage.settings import DEFAULT_SELECTION, SelectionSettings
 from calib.procedure.measuring import prediction as forecast
+from calib.procedure.measuring.measuring_run import Drivable, Exchange, MeasuringRun, RunSettings, drivable
+from calib.procedure.measuring.measuring_run import lines as run_lines
 from calib.procedure.measuring.pose_limits import Limits, read_limits
 from calib.procedure.measuring.prediction import Prediction, SelectionPrediction
-from calib.procedure.measuring.run import Drivable, Exchange, MeasuringRun, RunSettings, drivable
-from calib.procedure.measuring.run import lines as run_lines
 from calib.procedure.robot_kinds import joints_of
 from calib.robot.calibrated import CalibratedChain
 from calib.robot.chain import Chain, joint_kinds

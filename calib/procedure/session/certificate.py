@@ -14,7 +14,7 @@ from calib.procedure.export.delivery import prediction
 from calib.procedure.kinematic_stage.folder import SCHEMA, URDF
 from calib.procedure.kinematic_stage.metrics import FitMetrics
 from calib.procedure.report import fit_report
-from calib.procedure.report.certificate import dynamics, geometry, rendering
+from calib.procedure.report.certificate import dynamics_pages, geometry, rendering
 from calib.procedure.report.certificate.record import EDITED, Certificate, Entry, Page, StageRecord, records
 from calib.procedure.report.certificate.results import measured_range, tolerance
 from calib.procedure.report.fit_report import RowErrors, file_row, unseen_role
@@ -115,7 +115,7 @@ def _dynamics(session: Session) -> StageRecord:
         figures = pictures(captioned(report, session.identification.path))
         training = session.path("6-excitation") / "training"
         if session.settings.dynamics.plan and (training / coefficients.NAME).exists():
-            figures["excitation"] = picture(*dynamics.trained_on(training, chain_of(session).joints))
+            figures["excitation"] = picture(*dynamics_pages.trained_on(training, chain_of(session).joints))
     allowed = session.settings.dynamics.tolerance_percent
     predicted = prediction(session.path(session.export))
     delivered = None if predicted is None else predicted.exported
@@ -123,7 +123,7 @@ def _dynamics(session: Session) -> StageRecord:
     section = dynamics_section.report_section(report, figures, exported, allowed, delivered)
     verdict = session.verdicts().stages["dynamics"]
     section = replace(section, verdict=verdict.level, reason=verdict.reason)
-    stage = dynamics.stage(report, section, session.plots, allowed)
+    stage = dynamics_pages.stage(report, section, session.plots, allowed)
     return _with_arrival(stage, _arrival_notes(session, "7-recorded", "predict"))
 
 

@@ -42,11 +42,11 @@ from calib.procedure.kinematic_stage import inputs, selection
 from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
 from calib.procedure.kinematic_stage.validation import assess
 from calib.procedure.measuring.constraints_file import VIEW_UNCHECKED
+from calib.procedure.measuring.measuring_run import same_turn, write_run
 from calib.procedure.measuring.pose_limits import read_limits
 from calib.procedure.measuring.prediction import beside
 from calib.procedure.measuring.prediction import read as read_prediction
 from calib.procedure.measuring.prediction import write as write_prediction
-from calib.procedure.measuring.run import same_turn, write_run
 from calib.procedure.report import fit_report
 from calib.procedure.report.geometry_section import error_words, outlier_sentences, parameter_words
 from calib.procedure.report.outputs import write_fit

@@ -9,7 +9,7 @@ import calib
 from calib import cli
 from calib.apps.monitoring.log import log
 from calib.errors import SessionError, UsageError
-from calib.procedure.session.results import position_errors
+from calib.procedure.session.session_results import position_errors
 
 pytestmark = pytest.mark.slow
 

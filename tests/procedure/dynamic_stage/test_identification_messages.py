@@ -19,9 +19,9 @@ from calib.errors import UsageError
 from calib.identification.gains import DriveGains
 from calib.identification.identify_options import IdentifyOptions
 from calib.identification.prediction import PredictionErrors, RelativeErrors
-from calib.procedure.dynamic_stage.gains import FoundGains
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
 from calib.procedure.dynamic_stage.metrics import TorqueCurves
+from calib.procedure.dynamic_stage.recorded_gains import FoundGains
 from calib.procedure.dynamic_stage.replay import Replay
 from calib.procedure.report import charts, dynamics_figures, dynamics_section, page
 from calib.robot.calibrated import CalibratedChain

@@ -14,8 +14,8 @@ from calib.identification.checks.recording_sizes import compare_sizes, signs_of
 from calib.identification.identify_options import parse_options
 from calib.identification.rows import Case
 from calib.procedure.dynamic_stage import plausibility
-from calib.procedure.dynamic_stage.gains import find_gains
 from calib.procedure.dynamic_stage.inputs import gather, read_motion
+from calib.procedure.dynamic_stage.recorded_gains import find_gains
 from calib.robot.chain import Chain
 from calib.robot.library import load
 

@@ -15,11 +15,11 @@ from calib.errors import UsageError
 from calib.geometry.observability import observation, targets_of
 from calib.poses.candidates import draw_candidates
 from calib.poses.space import is_feasible
-from calib.procedure.measuring import run as measuring
+from calib.procedure.measuring import measuring_run as measuring
 from calib.procedure.measuring.constraints_file import ConstraintsFile
+from calib.procedure.measuring.measuring_run import Exchange, RunSettings, drivable, plan_run, turns, write_run
 from calib.procedure.measuring.pose_limits import Limits, limits_of, read_limits
 from calib.procedure.measuring.prediction import predicted
-from calib.procedure.measuring.run import Exchange, RunSettings, drivable, plan_run, turns, write_run
 from calib.procedure.session.questions import cell_tables
 from calib.results.scene_files import is_run, rehearsed_samples
 from calib.robot.chain import Chain, random_joints

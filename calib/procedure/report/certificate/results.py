@@ -126,7 +126,7 @@ def of_model(
 ) -> tuple[Certificate, Page]:
     """Return certificate and report of an identification."""
     from calib.procedure.report import dynamics_section
-    from calib.procedure.report.certificate import dynamics
+    from calib.procedure.report.certificate import dynamics_pages
 
     unseen, metrics = model_report.unseen, model_report.metrics
     recordings = ", ".join((*unseen.fit, *unseen.validation))
@@ -140,7 +140,7 @@ def of_model(
         Entry("toolkit", versions()),
     ]
     section = dynamics_section.report_section(model_report, drawn)
-    stages = [dynamics.stage(model_report, section, bool(drawn))]
+    stages = [dynamics_pages.stage(model_report, section, bool(drawn))]
     unchecked = ["geometry: taken as described"]
     return records(f"Calibration of {unseen.robot}", "Dynamics", setup, stages, unchecked, details=details)
 

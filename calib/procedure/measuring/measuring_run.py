@@ -498,7 +498,7 @@ def drivable(
     """Return the run through poses q (m, n), in which poses without a clear path are replaced by candidates.
 
     Args:
-        chain, limits, settings, seed, progress: see `calib.procedure.measuring.run.plan_run`.
+        chain, limits, settings, seed, progress: see `calib.procedure.measuring.measuring_run.plan_run`.
         exchange: what poses are replaced from.
     """
     show = progress or _silent
