@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import BadInput, NothingFeasible
-from ..timing.path_limits import Law, TimingLimits
 from ..timing.path import Path
+from ..timing.path_limits import Law, TimingLimits
 from ..timing.profile import Profile
 
 

@@ -18,8 +18,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ..errors import BadInput, NothingFeasible
-from ..timing.path_limits import Law, TimingLimits
 from ..timing.path import Path, reversals
+from ..timing.path_limits import Law, TimingLimits
 from ..timing.profile import Profile, Sampled, dense, moved
 from ..timing.reachability import ConstraintRows, fastest
 
