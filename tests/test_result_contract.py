@@ -312,7 +312,7 @@ def test_a_result_in_memory_has_what_its_folder_has(results):
     with pytest.raises(
         CalibError, match=r"^<MotionPlan for tx40.*> is a motion of calib plan; give the folder of a fit"
     ):
-        calib.export(plan, results / "none")  # type: ignore[arg-type]
+        calib.export(plan, results / "none")
 
 
 def test_advice_is_for_verbs_that_exist():

@@ -18,7 +18,7 @@ from calib.procedure.kinematic_stage import fit as arm_fit
 from calib.procedure.kinematic_stage import inputs as measured
 from calib.procedure.robot_kinds import MechanismResult
 from calib.results.registry import open_result
-from calib.results.result import ExportSettings
+from calib.results.result import ExportSettings, Result
 
 
 @overload
@@ -56,7 +56,7 @@ def validate(
 
 @checked
 def export(
-    result: GeometryFit | DynamicsModel | MechanismResult | str | Path,
+    result: Result | str | Path,
     into: str | Path,
     *,
     urdf: str | Path | None = None,

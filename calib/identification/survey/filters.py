@@ -57,8 +57,7 @@ class _KalmanFilter(Method):
         plain = WLS.estimate(problem)
         if not plain.found:
             return replace(plain, method=self.name)
-        believed = believed_robot(problem, self)
-        return attempted(self.name, problem, lambda: self._estimate(problem, plain, believed))
+        return attempted(self.name, problem, lambda: self._estimate(problem, plain, believed_robot(problem, self)))
 
     def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, robot: BelievedRobot) -> MethodEstimate:
         values = plain.estimate.values
