@@ -1,6 +1,7 @@
-"""Results as text and HTML: console text for ``print(result)``, and a page for notebooks, which a room makes.
+"""Base classes of results in memory: console text for ``print(result)``, and a page for notebooks.
 
-What the verbs take in several forms: one or many, a file that may be missing, a result or its folder.
+And helpers for arguments of the verbs that have several forms: one or many, a file that may be missing, a result or its
+folder.
 """
 
 from __future__ import annotations

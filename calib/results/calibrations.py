@@ -85,7 +85,7 @@ class StoredFit(CalibratedRobot):
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict: in a session that on its unseen poses."""
+        """The fit's verdict; within a session, that on its unseen poses."""
         return self.verdicts.stages.get("geometry", super().verdict)
 
     @property
@@ -113,7 +113,7 @@ class StoredIdentification(CalibratedRobot):
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict: in a session that on its unseen motion."""
+        """The identification's verdict; within a session, that on its unseen motion."""
         return self.verdicts.stages.get("dynamics", super().verdict)
 
     @property

@@ -139,7 +139,7 @@ class StoredResult:
         return None
 
     def check_arm(self, verb: str) -> None:
-        """Refuse a robot of another kind than a serial arm, of which the verb does not take results."""
+        """Refuse results of robots that are no serial arms; the base class accepts all."""
 
     def require_session(self) -> Session:
         """Refuse: this is no session."""

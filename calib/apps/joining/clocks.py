@@ -40,9 +40,9 @@ from calib.toolkit.pose_data import Positions, take
 from calib.toolkit.statistics import gram, relevance, robust_weights, spread
 from calib.transforms import invert, rotation_vector
 
-# of the offsets that are tried first [s]
+# step of the grid of offsets that are tried first [s]
 GRID = 0.05
-# by which the tip's turning counts as speed, since the target's position at the tip is not known [m]
+# lever arms by which the tip's turning counts as speed, since the target's place at the tip is unknown [m]
 LEVERS = (0.0, 0.15, 0.4)
 # number of offsets that are tried for each lever, and their least distance [s]
 PEAKS, PEAK_DISTANCE = 3, 1.0
@@ -52,7 +52,7 @@ OVERLAP = 0.5
 TRIMMED = 90
 # rows that placements are guessed from
 PLACED = 300
-# of the points' spread that a log of the same motion leaves with the nominal arm
+# residual of the nominal arm over the points' spread up to which a log is of the same motion
 MAX_RATIO = 0.15
 # times the residual of the best offset, up to which another one is as good
 RIVAL = 1.3
@@ -60,13 +60,13 @@ RIVAL = 1.3
 MAX_DRIFT = 1e-3
 # difference of times by which speeds are computed [s]
 TIME_STEP = 1e-3
-# of the harmonics that are fitted
+# highest order of the harmonics that are fitted
 ORDERS = 6
-# of Gauss-Newton
+# most rounds of Gauss-Newton
 ROUNDS = 12
-# change of the offset after which it ends [s]
+# change of the offset below which the rounds end [s]
 SETTLED = 1e-6
-# times their guessed size that terms are, at least and at most
+# least and largest size of terms over their guessed size
 TERM_SIZES = (1e-3, 5.0)
 _NONE = np.array([], dtype=int)
 

@@ -81,7 +81,7 @@ class LogLine:
 
     @property
     def parameter(self) -> str:
-        """That parameter with its change and σ."""
+        """Name, change and σ of the parameter in `first`; empty without."""
         change = self.first
         if change is None:
             return ""
@@ -137,10 +137,10 @@ class RobotLog(ChartedResult, Judged, Unjudged):
             expected.append(motion[1])
         dates = [log_line.date for log_line in self.lines]
         numbers = range(len(dates))
-        errors_drawn = [line(numbers, errors, "o-", AFTER, label="found")]
+        errors_drawn = [line(numbers, errors, "o-", AFTER, label="measured")]
         motion_drawn = [
-            line(numbers, motions, "o-", AFTER, label="found"),
-            line(numbers, expected, "+", BEFORE, label="σ lets expect"),
+            line(numbers, motions, "o-", AFTER, label="measured"),
+            line(numbers, expected, "+", BEFORE, label="expected from σ"),
         ]
         panels = [
             Panel(errors_drawn, "error on unseen poses [mm]", xnames=dates),
@@ -231,7 +231,7 @@ def log(folders: Sequence[str | Path], *, mixed: bool = False) -> RobotLog:
 def _check_same(attribute: str, names: Sequence[str], mixed: bool) -> None:
     """Refuse sessions that state several names, unless they are to be mixed; sessions without one go with all."""
     different = list(dict.fromkeys(name for name in names if name))
-    message = f"the sessions are of other {attribute} ({', '.join(different)}); --mixed takes them for one robot"
+    message = f"the sessions have different {attribute} ({', '.join(different)}); --mixed takes them for one robot"
     require(len(different) < 2 or mixed, message, UsageError)
 
 

@@ -68,7 +68,7 @@ STYLE: "dict[RcKeyType, str | float | bool]" = {
 
 @contextmanager
 def styled(quiet_titles: bool = False) -> Iterator[None]:
-    """Apply the common style within a context, then restore matplotlib's settings; `quiet` makes titles small."""
+    """Apply the common style within a context, then restore matplotlib's settings; `quiet_titles` makes them small."""
     settings = dict(STYLE)
     if quiet_titles:
         settings |= {"axes.titleweight": "normal", "axes.titlesize": 7.5}
