@@ -115,7 +115,7 @@ def case_names(paths: Sequence[str]) -> tuple[str, ...]:
     """
     repeated = sorted({path for path in paths if list(paths).count(path) > 1})
     if repeated:
-        raise UsageError(f"{repeated[0]} is given twice")
+        raise UsageError(f"recording {repeated[0]} is listed twice, to fit or to validate: name each once")
     file_names = [_file(path) for path in paths]
     candidates = []
     for path, file_name in zip(paths, file_names):

@@ -171,7 +171,7 @@ def test_other_folders_are_not_overwritten(robot, tmp_path, capsys):
     assert run(robot, train, "--out", out) == 2
     assert (out / "estimate.csv").read_text() == "mine"
     assert run(robot, train, train, "--out", tmp_path / "b") == 2
-    assert "is given twice" in capsys.readouterr().err
+    assert "is listed twice" in capsys.readouterr().err
 
 
 def test_every_key_of_the_documented_options_is_read(tmp_path):
