@@ -170,14 +170,16 @@ def _swings(mask: np.ndarray, target: np.ndarray, segment: np.ndarray) -> np.nda
 
 @dataclass(frozen=True, eq=False)
 class DividedRows:
-    """R factors of moving rows and of standing ones apart, one group per torque row, so that their weights may change.
+    """R factors of moving rows and of standing rows, kept separate so that their weights may change; a group per torque
+    row.
 
     Attributes:
-        moving, standing: the latter's rows scaled by the root of their share of a standstill.
-        swinging: standing rows scaled by the root of that share times the range of the torque.
-        standstills: (rows,) how many there are.
-        swing: (rows,) mean range of the torque in one [N m or N].
-        length: (rows,) their mean number of rows.
+        moving, standing: R factors of rows in motion, and of rows at rest scaled by the root of their share of a
+            standstill.
+        swinging: R factors of rows at rest scaled by the root of that share times the range of the torque.
+        standstills: (rows,) number of standstills.
+        swing: (rows,) mean range of the torque in a standstill [N m or N].
+        length: (rows,) mean number of rows of a standstill.
         coulomb: (rows, p) which columns are Coulomb friction of a torque row.
     """
 
@@ -260,10 +262,10 @@ def with_breakaway(
     torque_rows: TorqueRows,
     values: np.ndarray,
 ) -> list[ObservationRows]:
-    """Return rows after standstills weighed by how far friction is on its way to the value of motion, see the module.
+    """Return rows weighted by how far friction after a standstill has approached its value in motion, see the module.
 
     Args:
-        values: (p,) of a fit, whose residuals say over which travel that is.
+        values: (p,) parameters of a fit, from whose residuals the travel δ is estimated.
     """
     parts = divided(all_rows)
     spread = parts.standing.residual_squares(values) / np.maximum(parts.standstills, 1.0)
@@ -343,11 +345,11 @@ def left_out_error(
     torques are fitted by wrong parameters would count most.
 
     Args:
-        training: rows with the treatment of standstills that is judged.
+        training: rows with the tested treatment of standstills.
         marked: the same samples with their standstills marked.
         std, inflation: (rows,) standard deviation and variance inflation of the residuals.
         prior: whitened rows (k, p + 1) of [W y]; None without one.
-        apart: rows in a unit of their own, which no total holds.
+        apart: rows in a different unit, excluded from the sum.
     """
     rows = training[0].target.shape[1]
     data = triangulate(training)

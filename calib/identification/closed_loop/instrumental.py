@@ -508,8 +508,8 @@ def _simulate_new(
 ) -> tuple[_Fixed, _Found, Plant, Runs, int]:
     """Return the simulations with the new parameters or, if these fail, with smaller steps from the old ones.
 
-    If those fail as well, constraints on the inertia are raised (our choice): no sampled controller can hold a robot
-    with almost no inertia.
+    Where M(q) is on its bound, that bound is raised first (our choice): a sampled controller cannot hold a robot with
+    almost no inertia.
     """
     retreats = 0
     while True:

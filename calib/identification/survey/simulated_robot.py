@@ -224,10 +224,10 @@ class BelievedRobot:
     """Robot model to be simulated with the parameters of an identification problem.
 
     Attributes:
-        model: with richer friction, where the problem has any.
+        model: model including the problem's richer friction.
         columns: (p,) place of each of the problem's parameters among the plant's; without motor torques, those of the
             motors follow.
-        plant: with all parameters zero; of another model than a serial arm's, what its `plant` returns.
+        plant: plant with all parameters zero; for a model that is no serial arm, the result of its `plant`.
         steps: (p,) of differences for a robot without tangents, 0.01 σ of least squares; None for a serial arm.
     """
 
@@ -275,7 +275,7 @@ def serial_arm(problem: IdentificationProblem, method: Method) -> Identification
     """Return the model of a problem; raise unless it is a serial arm with torque rows that the method takes.
 
     Raises:
-        UsageError: for another.
+        UsageError: for any other model.
     """
     model = problem.model
     if not isinstance(model, IdentificationModel) or not method.takes(model.torque_rows):
@@ -338,12 +338,12 @@ def start_of(
     """Return initial parameters (p,): the given ones, or those nearest to least squares that can be simulated.
 
     Args:
-        plain: (p,) of weighted least squares.
+        plain: (p,) estimate by weighted least squares.
         inertia: (n,) of a regular robot, which nothing couples [kg m² or kg].
         simulated: raises `CalibError` where values cannot be simulated.
 
     Raises:
-        CannotSimulate: where none can be.
+        CannotSimulate: where no values can be simulated.
     """
     if problem.start is not None:
         return np.array(problem.start, dtype=float)

@@ -73,7 +73,7 @@ class _HeldOut:
     """Prediction errors on held-out time, and the terms of their expected variance.
 
     Attributes:
-        errors: (m, rows) of the torques [N m or N].
+        errors: (m, rows) errors of the torques [N m or N].
         variance_terms: (m, rows, 3) variance due to the parameters, 1, and log(1 + d²).
         moves: (m, rows) whether the row's joint moves.
     """
@@ -328,7 +328,7 @@ def _hold_out(
 ) -> _HeldOut:
     """Return the errors on the blocks of a run, predicted by the parameters that all other blocks give.
 
-    No error counts for more than the torque itself: a fold that fails wholly says nothing of how the whole model errs.
+    Errors are limited to the size of the torque: a fold that fails completely does not represent the final model.
 
     Args:
         standing_speeds: (n,) speeds below which a joint stands.
