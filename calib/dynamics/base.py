@@ -241,8 +241,7 @@ def r_factor(model: RegressorModel, samples: States, loads: Loads = (None,)) -> 
 
 
 def expressions(base: Base) -> tuple[str, ...]:
-    """Return each base parameter as a sum of standard ones, e.g. ``ZZ1R = ZZ1 + YY2``; small coefficients are omitted.
-    """
+    """Return each base parameter as sum of standard ones, e.g. ``ZZ1R = ZZ1 + YY2``; small coefficients are omitted."""
     lines = []
     for name, column, row in zip(base.names, base.kept, base.split.coefficients):
         text = base.standard[column]
@@ -302,8 +301,7 @@ def _clean(split: ColumnSplit) -> ColumnSplit:
 
 
 def _norms(factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mask (p,) of columns without effect, and the norms (p,) of all columns (1 for those without effect).
-    """
+    """Return mask (p,) of columns without effect, and the norms (p,) of all columns (1 for those without effect)."""
     norms = np.linalg.norm(factor, axis=0)
     without_effect = norms <= 1e-12 * norms.max(initial=0.0)
     return without_effect, np.where(without_effect, 1.0, norms)

@@ -269,8 +269,7 @@ def _join(
 
 
 def _weighted(motion: Motion, series: np.ndarray) -> np.ndarray:
-    """Return the weighted sum (N,) of the joints' series (n, N); a single joint of weight 1 is returned without a copy.
-    """
+    """Return weighted sum (N,) of the joints' series (n, N); a single joint of weight 1 is returned without a copy."""
     if len(motion) == 1:
         joint, weight = motion[0]
         if weight == 1.0:

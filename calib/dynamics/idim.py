@@ -387,7 +387,6 @@ def from_chain(
 
 
 def friction_states(model: RegressorModel, q: np.ndarray) -> np.ndarray:
-    """Return the states (s, N) of friction with hysteresis along an uninterrupted record q (N, n), not cut into blocks.
-    """
+    """Return states (s, N) of friction with hysteresis along an uninterrupted record q (N, n), not cut into blocks."""
     q = shaped(q, (None, model.n), "q")
     return drives.friction_states(model.columns, np.ascontiguousarray(q.T))

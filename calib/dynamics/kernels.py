@@ -216,8 +216,7 @@ def carry(links, constants, i, frames, twists):
 
 @njit(**OPTIONS)
 def _place_lanes(constants, i, joint, turn):
-    """Write rotation (rows 0 to 8) and origin (9 to 11) of body i into `turn`, from cosine, sine and shift in `joint`.
-    """
+    """Write rotation (rows 0 to 8) & origin (9 to 11) of body i into `turn`, from cosine, sine and shift in `joint`."""
     a0 = constants[i, 0]
     a1 = constants[i, 1]
     a2 = constants[i, 2]

@@ -62,8 +62,7 @@ def divergence(pseudo: np.ndarray, reference: np.ndarray) -> float:
 
 
 def ball(mass: float, radius: float, centre: np.ndarray | None = None) -> np.ndarray:
-    """Return the ten standard parameters about the link frame of a homogeneous ball (mass [kg], radius and centre [m]).
-    """
+    """Return ten standard parameters about the link frame of a homogeneous ball (mass [kg], radius and centre [m])."""
     if centre is None:
         centre = np.zeros(3)
     centre = np.asarray(centre, dtype=float)

@@ -26,8 +26,7 @@ MAX_MOVE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ConeOptimum:
-    """Optimum b (p,) of a cone program, with the multipliers of its rows (c,), matrices (k, n, n) and equalities (e,).
-    """
+    """Optimum b (p,) of a cone program, with multipliers of its rows (c,), matrices (k, n, n) and equalities (e,)."""
 
     values: np.ndarray
     rows: np.ndarray

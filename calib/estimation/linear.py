@@ -139,8 +139,7 @@ def settled_std(data: Triangles, tolerance: float = 1e-6, limit: int = 200) -> n
 
 
 def _fit(data: Triangles, std: np.ndarray, inflation: np.ndarray | None, stated: bool) -> LinearFit:
-    """Return the fit with rows divided by std; `stated`: whether std is the noise itself or the noise up to a factor.
-    """
+    """Return fit with rows divided by std; `stated`: whether std is the noise itself or the noise up to a factor."""
     values, inverse, conditions = solve_triangle(combine(data, std), data.names)
     covariance = inverse @ inverse.T
     tau = np.ones(data.groups)

@@ -162,8 +162,7 @@ class _Elimination:
         return cls(columns, root, half, target)
 
     def values(self, other_values: np.ndarray) -> np.ndarray:
-        """Return the values (f,) of the eliminated columns from those of all others (p,), zero at the eliminated ones.
-        """
+        """Return values (f,) of the eliminated columns from those of all others (p,), zero at the eliminated ones."""
         return solve_triangular(self.root, self.target - self.half @ other_values, trans=1, lower=True)
 
 

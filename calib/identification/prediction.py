@@ -125,9 +125,7 @@ class Score:
 
     @property
     def judged(self) -> PredictionErrors:
-        """Errors that the verdict uses: those in motion (friction at rest is undetermined); all errors if no joint is
-        at rest.
-        """
+        """Errors that the verdict uses: in motion, as friction at rest is undetermined; all, if no joint is at rest."""
         return self.moving if self.stands else self.raw
 
     @property

@@ -395,8 +395,7 @@ def _gravity_factors(
 
 
 def _inertia_factor(motions: Sequence[MotionSamples], reference: np.ndarray) -> float:
-    """Return the ratio of the robot's inertias to those of bodies (10 B,), for any gravity; NaN where not identified.
-    """
+    """Return ratio of the robot's inertias to those of bodies (10 B,), for any gravity; NaN where not identified."""
     moving = []
     free = []
     torque = []

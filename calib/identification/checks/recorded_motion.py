@@ -173,8 +173,7 @@ def _sampled(t: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
 
 
 def _one_period(motion: DesignedMotion, speed: float = 1.0) -> np.ndarray:
-    """Return the positions (P, n) of one period of a motion at `speed` times its speed, sampled about every `STEP` [s].
-    """
+    """Return positions (P, n) of one period of a motion at `speed` times its speed, sampled about every `STEP` [s]."""
     count = round(motion.period / speed / STEP)
     q, _, _ = motion.orders(np.arange(count) * motion.period / count)
     return q

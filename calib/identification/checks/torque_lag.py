@@ -220,8 +220,7 @@ class _LagFit:
         return self._unexplained(self.rows.torque[joints, lags], projection)
 
     def _unexplained(self, torque: np.ndarray, parts: np.ndarray) -> np.ndarray:
-        """Return weighted torques (n, m) without their projections onto the basis, whose coefficients are `parts` (k,).
-        """
+        """Return weighted torques (n, m) without their projections onto basis, whose coefficients are `parts` (k,)."""
         explained = self.rows.columns @ (self.spanning @ parts)
         return self.weight[:, None] * (torque - explained)
 

@@ -103,8 +103,7 @@ def unstated_load(samples: Mapping[str, MotionSamples]) -> UnstatedLoad | None:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Residuals (m, n) by recording, values of bodies and rotors (p,) and of a load (10,), and the load mass's sigma.
-    """
+    """Residuals (m, n) by recording, values of bodies and rotors (p,) and of a load (10,), and load mass's sigma."""
 
     residuals: list[np.ndarray]
     bodies: np.ndarray

@@ -468,8 +468,7 @@ def advance_points(tree, body, linear, kinds, acts, order, entries, shares, owne
 
 @njit(**OPTIONS)
 def command(gains, aim, speed, seen, rate, integral, period, wish):
-    """Write the feedback command (n,) into `wish`, from reference and measurement; rows of `gains` as in `closed_loop`.
-    """
+    """Write feedback command (n,) into `wish`, from reference and measurement; rows of `gains` as in `closed_loop`."""
     for j in range(wish.shape[0]):
         error = aim[j] - seen[j]
         integral[j] = min(max(integral[j] + period * error, -gains[5, j]), gains[5, j])

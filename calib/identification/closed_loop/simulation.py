@@ -429,8 +429,7 @@ def tracking_error(
 
 
 def plant_of(model: Any, values: np.ndarray, terms: Sequence[DriveTerm] = ()) -> Any:
-    """Return the simulable robot of a model with parameter values and further terms (an arm's, or the model's `plant`).
-    """
+    """Return simulable robot of a model with parameter values and further terms (an arm's, or the model's `plant`)."""
     if isinstance(model, IdentificationModel):
         return Plant(model.bodies, (*model.columns, *terms), values)
     return model.plant(values, terms)
