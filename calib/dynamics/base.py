@@ -1,13 +1,14 @@
-"""Base parameters: which columns of the regressor carry information, and what each of them stands for.
+"""Base parameters: the independent columns of the regressor and the standard parameters that each combines.
 
     W chi = W_kept (chi_kept + K chi_dropped) = W_kept chi_base,    W_dropped = W_kept K
 
-(Gautier 1991, numerically by QR). Which columns are kept is our choice where the algebra leaves one: Khalil's, who
-regroups YY, MZ, M of a link behind a revolute joint, and the six moments of inertia of one behind a prismatic joint, on
-the links before (Khalil & Kleinfinger 1987). The columns are tried one after another in a fixed order, not by the size
-of pivots, so that no rounding of a BLAS library decides between equals.
+(Gautier 1991, numerically by QR). Where several choices of kept columns are equivalent, Khalil's is taken: he regroups
+YY, MZ, M of a link behind a revolute joint, and the six moments of inertia of a link behind a prismatic joint, into the
+parameters of the links before it (Khalil & Kleinfinger 1987). The columns are tried one after another in a fixed order,
+not by the size of pivots, so that no rounding of a BLAS library decides between equivalent columns.
 
-Columns are chosen on the nominal chain; `regroup` recomputes K on the calibrated one, where it holds only nearly.
+Columns are chosen on the nominal chain; `regroup` recomputes K on the calibrated chain, where W_dropped = W_kept K
+holds only approximately.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -41,11 +42,12 @@ class Base:
     Attributes:
         rows: name of the model's torque rows.
         standard: names of the p parameters of the model.
-        standard_units: their units.
+        standard_units: units of the p standard parameters.
         split: the kept and dropped columns, K = ``split.coefficients``, singular values and their gap.
-        remainder: (p - b,) remainder of each dropped column after K, relative to its norm: rounding error on the
-            original chain, more after `regroup`.
-        lost: (p - b,) the same as a torque: rms over the samples' rows per unit of the parameter [N m or N per unit].
+        remainder: (p - b,) part of each dropped column that W_kept K does not reproduce, relative to the column's norm:
+            rounding error on the original chain, more after `regroup`.
+        lost: (p - b,) the remainder as a torque: rms over the samples' rows per unit of the parameter [N m or N per
+            unit].
     """
 
     rows: str
@@ -62,7 +64,7 @@ class Base:
 
     @property
     def kept(self) -> np.ndarray:
-        """Columns (b,) of the model that the base parameters are of."""
+        """Indices (b,) of the model's columns whose coefficients are the base parameters."""
         return self.split.kept
 
     @property
@@ -78,7 +80,7 @@ class Base:
 
     @property
     def transform(self) -> np.ndarray:
-        """Matrix (b, p) of base = transform @ standard."""
+        """Matrix (b, p) that maps standard to base parameters: base = transform @ standard."""
         result = np.zeros((self.b, len(self.standard)))
         result[np.arange(self.b), self.kept] = 1.0
         result[:, self.split.dropped] = self.split.coefficients
@@ -86,7 +88,7 @@ class Base:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the b parameters, with R if others are regrouped into them by at least `MIN_COEFFICIENT`."""
+        """Names of the b base parameters; suffix R: others are regrouped into them by at least `MIN_COEFFICIENT`."""
         names = []
         for column, coefficients in zip(self.kept, self.split.coefficients):
             regrouped = (np.abs(coefficients) >= MIN_COEFFICIENT).any()
@@ -95,11 +97,11 @@ class Base:
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Units of the b parameters."""
+        """Units of the b base parameters."""
         return tuple(self.standard_units[column] for column in self.kept)
 
     def to_standard(self, values: np.ndarray) -> np.ndarray:
-        """Return standard parameters (p,) with the same torques: base values for the kept ones, zero for the others."""
+        """Return standard parameters (p,) with the same torques: base values for the kept ones, zero for all others."""
         result = np.zeros(len(self.standard))
         result[self.kept] = shaped(values, (self.b,), "base parameters")
         return result
@@ -117,12 +119,12 @@ class BaseModel:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the b parameters."""
+        """Names of the b base parameters."""
         return self.base.names
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Units of the b parameters."""
+        """Units of the b base parameters."""
         return self.base.units
 
     def regressor(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
@@ -152,7 +154,7 @@ def random_samples(
     lower: np.ndarray | None = None,
     upper: np.ndarray | None = None,
 ) -> States:
-    """Return `count` random states of a model within limits (n,) of its coordinates; see its `sample`."""
+    """Return `count` random states from the model's `sample`, within limits (n,) of its coordinates if given."""
     return model.sample(count, np.random.default_rng(seed), lower, upper)
 
 
@@ -166,13 +168,14 @@ def find(
     """Return the base parameters of a model: independent columns of its regressor.
 
     Args:
-        model: linear in its parameters.
-        samples: states to compare columns over; default `random_samples`. With recorded motion: the parameters that
-            this motion identifies.
-        loads: the load cases stacked, each as `carried` of the regressor; default with all payloads and without, if
-            the model has any.
-        tolerance: minimum part of a column of unit norm that is independent of the columns before.
-        nominal: the same model on the geometry that columns are chosen on; None: `model`.
+        model: torques as a linear function of p parameters.
+        samples: states at which columns are compared; default `random_samples`. With states of a recorded motion, the
+            base parameters are those that this motion identifies.
+        loads: load cases whose rows are stacked, each in the form of the regressor's argument `carried`; default: the
+            model's `load_cases`.
+        tolerance: a column of unit norm is kept if the part of it that is independent of the columns before has at
+            least this norm.
+        nominal: the same model on the geometry on which columns are chosen; None: `model`.
     """
     if samples is None:
         samples = random_samples(model)
@@ -187,10 +190,11 @@ def find(
 
 
 def regroup(base: Base, model: RegressorModel, samples: States | None = None, loads: Loads | None = None) -> Base:
-    """Return the base recomputed for another geometry with the same columns: W_dropped ≈ W_kept K by least squares.
+    """Return the base recomputed for another geometry with the same kept columns.
 
-    The remainder says how well that holds over the samples. Columns without effect on the nominal chain (on the
-    calibrated one a small one) take part; the singular values are those of the new geometry.
+    K follows from W_dropped ≈ W_kept K by least squares; `Base.remainder` says how well this holds over the samples.
+    Columns without effect on the nominal chain take part, since they may have a small effect on the calibrated one; the
+    singular values are those of the new geometry.
     """
     _require_same(base, model)
     if samples is None:
@@ -215,8 +219,8 @@ def regroup(base: Base, model: RegressorModel, samples: States | None = None, lo
 def r_factor(model: RegressorModel, samples: States, loads: Loads = (None,)) -> np.ndarray:
     """Return the R factor (p, p) of the observation matrix over samples and load cases, block by block.
 
-    One triangle per torque row is updated with the columns that row can see at all (a joint does not feel the links
-    before it), then all are stacked: memory is bounded by a block, whatever the number of samples.
+    One triangle per torque row is updated with the columns that can affect this row (the links before a joint do not
+    act on it), then all triangles are stacked: the memory needed is that of one block, whatever the number of samples.
     """
     p = model.p
     states = samples.states
@@ -237,7 +241,7 @@ def r_factor(model: RegressorModel, samples: States, loads: Loads = (None,)) -> 
 
 
 def expressions(base: Base) -> tuple[str, ...]:
-    """Return the base parameters as sums of standard ones, e.g. ``ZZ1R = ZZ1 + YY2``, without small coefficients."""
+    """Return each base parameter as sum of standard ones, e.g. ``ZZ1R = ZZ1 + YY2``; small coefficients are omitted."""
     lines = []
     for name, column, row in zip(base.names, base.kept, base.split.coefficients):
         text = base.standard[column]
@@ -262,9 +266,10 @@ def standard_name(name: str, standard: Collection[str]) -> str:
 
 
 def places(parameters: Sequence[str], names: Sequence[str], standard: Collection[str]) -> list[int] | None:
-    """Return where each of some base `parameters` stands among others' names; None if one does not.
+    """Return the indices of some base `parameters` in another list of `names`; None if one is not in the list.
 
-    What is regrouped into it, and so the R of its name, may differ by another geometry or by joint corrections.
+    Names are compared as `standard_name`: which parameters are regrouped, and so the suffix R, may differ on another
+    geometry or with joint corrections.
     """
     index_of = {standard_name(name, standard): index for index, name in enumerate(names)}
     standard_names = [standard_name(name, standard) for name in parameters]
@@ -274,7 +279,7 @@ def places(parameters: Sequence[str], names: Sequence[str], standard: Collection
 
 
 def _updated(triangle: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Return the R factor of [R factor; columnsᵀ] (p, p); columns (p, N)."""
+    """Return the R factor (p, p) of an R factor stacked on further rows, which are given transposed (p, N)."""
     nonzero = np.flatnonzero(columns.any(axis=1) | triangle.any(axis=0))
     count = len(nonzero)
     result = np.zeros_like(triangle)
@@ -296,7 +301,7 @@ def _clean(split: ColumnSplit) -> ColumnSplit:
 
 
 def _norms(factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mask of columns without effect, and the norms of all columns (1 for those without effect)."""
+    """Return mask (p,) of columns without effect, and the norms (p,) of all columns (1 for those without effect)."""
     norms = np.linalg.norm(factor, axis=0)
     without_effect = norms <= 1e-12 * norms.max(initial=0.0)
     return without_effect, np.where(without_effect, 1.0, norms)
@@ -319,7 +324,7 @@ def _describe(model: RegressorModel, split: ColumnSplit, factor: np.ndarray, sam
 
 
 def _require_same(base: Base, model: RegressorModel) -> None:
-    """Raise an error for base parameters of another model."""
+    """Raise `CalibError` if base parameters belong to another model."""
     if (base.rows, base.standard) != (model.torque_rows.name, model.names):
         raise CalibError("the base parameters belong to another model: rows or parameter names differ")
 
@@ -330,9 +335,9 @@ def information(
     """Return the information Σ ωᵀω (b, b) of a motion with regressors ω.
 
     Args:
-        model: with b columns.
-        q, v, a: (N, n) [rad or m, and per s, per s²].
-        sigmas: (rows,) by which the rows of ω are divided; None: 1.
+        model: base model with b columns.
+        q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+        sigmas: (rows,) standard deviations by which the rows of ω are divided; None: 1.
     """
     b = len(model.names)
     total = np.zeros((b, b))
@@ -360,11 +365,11 @@ def columns_at_rest(
     """Return the indices (c,) of base columns that stay independent when some joints are at rest.
 
     Args:
-        model: with b columns.
+        model: base model with b columns.
         resting: joint → its position at rest [rad or m]; None: one random position.
         lower, upper: (n,) finite limits of the random states at which columns are compared.
-        known: (b, b) information of other motions, in which those joints may move.
-        unused: torque rows that do not count; default those of the resting joints.
+        known: (b, b) information of other motions, in which the resting joints may move; None: no other motions.
+        unused: torque rows that are not used; None: those of the resting joints.
     """
     states = random_samples(model.model, lower=lower, upper=upper)
     q = np.array(states.q)

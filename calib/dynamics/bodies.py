@@ -1,11 +1,11 @@
-"""The bodies of a robot as plain arrays: what the compiled kernels read.
+"""The rigid bodies of a robot as plain arrays, the input of the compiled kernels.
 
-A body's frame stands right after the element that moves it (`Chain.inertias` are about the same frame):
+A body's frame stands right after the element that moves it (`Chain.inertias` refer to this frame, too):
 
     T_i = T_parent(i) · placement_i · exp(axis_i · scale_i · q_{coordinate_i})
 
-with scale = sign · ratio, so a joint against its axis and a mimic joint's follower need no case of their own. A body
-without a coordinate is fixed to its parent (a payload).
+with scale = sign · ratio, so that a joint that turns against its axis and the follower of a mimic joint are no special
+cases. A body without a coordinate is fixed to its parent (a payload).
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ class Bodies:
         kinds: (B,) `FIXED`, `REVOLUTE` or `PRISMATIC`.
         axes: (B,) 0, 1, 2 for x, y, z of the body's own frame.
         scales: (B,) sign times mimic ratio; 0 for a fixed body.
-        coordinates: (B,) which of the n coordinates moves it; -1 for a fixed body.
-        placements: (B, 4, 4) of the body's frame in its parent's at q = 0.
-        gravity: (3,) in the base frame [m/s²].
+        coordinates: (B,) index of the coordinate that moves the body; -1 for a fixed body.
+        placements: (B, 4, 4) pose of the body's frame in its parent's frame at q = 0.
+        gravity: (3,) gravity vector in the base frame [m/s²].
         paths: (B, n) coordinates that move the body, in the order base to body, then -1.
         links: (B, 4 + n) parent, kind, coordinate, depth and path of every body, for the kernels.
-        constants: (B + 1, 13) the first three rows of every placement, between frames turned so that each moving axis
-            is z, and the scale; gravity in the last row; for the kernels.
-        order: (B, 10) indices in `STANDARD` of the parameters in the kernels' frames.
+        constants: (B + 1, 13) for the kernels: per body the first three rows of its placement, between frames turned so
+            that each moving axis is z, and its scale; gravity in the last row.
+        order: (B, 10) for the kernels: indices in `STANDARD` of the parameters about the kernels' frames.
     """
 
     labels: tuple[str, ...]
@@ -95,9 +95,9 @@ class Bodies:
 
 
 def bodies_of(chain: Chain) -> Bodies:
-    """Return the bodies of a chain: one behind each moving element (a mimic joint's followers are bodies, too).
+    """Return the bodies of a chain: one body behind each moving element, followers of mimic joints included.
 
-    Body j is numbered like its joint, from 1; a follower of joint 2 is ``2b``, the next one ``2c``.
+    Body j is numbered like its joint, from 1; the first follower of joint 2 is body ``2b``, the second ``2c``.
     """
     joint_elements = set(chain.moving.tolist())
     placement = np.eye(4)
@@ -133,11 +133,12 @@ def with_payload(bodies: Bodies, placement: np.ndarray, label: str | None = None
     """Return the bodies with a payload added, fixed to body `on` (default the last).
 
     Args:
-        bodies: of the robot.
-        placement: (4, 4), the frame of the payload's parameters in the frame of the body it is fixed to; `Chain.tail`
-            for the tip of a chain.
-        label: default the number after the last joint's, so 8 on an arm of seven joints.
-        on: index of the body; negative ones count from the last.
+        bodies: the robot's bodies.
+        placement: (4, 4) pose of the frame in which the payload's parameters are expressed, in the frame of body `on`;
+            `Chain.tail` for the tip of a chain.
+        label: suffix of the payload's parameters; None: the number after the last joint's, e.g. 8 on an arm of seven
+            joints.
+        on: index of the body that carries the payload; negative indices count from the last.
     """
     parent = range(bodies.count)[on]
     if label is None:
@@ -159,7 +160,7 @@ def with_payload(bodies: Bodies, placement: np.ndarray, label: str | None = None
 
 
 def standard_parameters(chain: Chain) -> np.ndarray:
-    """Return the 10·B standard parameters of `bodies_of(chain)` from the chain's inertias; mimic joints have none.
+    """Return the 10·B standard parameters of `bodies_of(chain)` from the chain's inertias; mimic followers: 0.
 
     Raises:
         RobotError: where the chain has no inertias.
@@ -203,7 +204,7 @@ def _assemble(
     gravity: np.ndarray,
     n: int,
 ) -> Bodies:
-    """Return the bodies with frozen arrays and the list of coordinates that move each body."""
+    """Return the bodies with arrays made read-only, and with the coordinates that move each body filled in."""
     count = len(labels)
     paths = np.full((count, n), -1)
     depths = np.zeros(count, dtype=int)
@@ -246,7 +247,7 @@ def _assemble(
 
 @cache
 def _kernel_order(axis: int) -> tuple[int, ...]:
-    """Return the indices (10,) in `STANDARD` of the parameters in the kernels' frame, by moving axis."""
+    """Return the indices (10,) in `STANDARD` of a body's parameters in the kernels' frame, given its moving axis."""
     turn = _TURNS[axis]
     order = []
     for row, column in PAIRS:
@@ -258,5 +259,5 @@ def _kernel_order(axis: int) -> tuple[int, ...]:
 
 @cache
 def upright_turn(axis: int) -> np.ndarray:
-    """Return the rotation (4, 4) from a body's frame to the kernels', with the joint axis (0, 1, 2: x, y, z) as z."""
+    """Return the rotation (4, 4) from a body's to the kernels' frame, whose z is the joint axis (0, 1, 2: x, y, z)."""
     return frozen(pose(np.eye(3)[:, _TURNS[axis]]))

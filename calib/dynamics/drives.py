@@ -2,9 +2,9 @@
 
     tau_r += parameter · Σ_joined shape(Σ_j weight_j · motion_j)
 
-A term acts on one torque row or on several, and in each sees the motion of one joint or of a weighted sum of joints, so
-a coupled wrist (TX40: tau5 += Iam6 a6 + Fvm6 v6 + Fcm6 sign(v5 + v6), tau6 += Iam6 a5 + Fvm6 v5 + Fcm6 sign(v5 + v6))
-is not a special case. Joint numbers here count from 0, in names from 1.
+A term acts on one torque row or on several; in each it depends on the motion of one joint or of a weighted sum of
+joints, so that a coupled wrist (TX40: tau5 += Iam6 a6 + Fvm6 v6 + Fcm6 sign(v5 + v6), tau6 += Iam6 a5 + Fvm6 v5 + Fcm6
+sign(v5 + v6)) is not a special case. Joints are counted from 0 in the code, from 1 in names.
 """
 
 import math
@@ -27,12 +27,12 @@ class DriveTerm:
     """One drive term: a column of the regressor.
 
     Attributes:
-        name: of its parameter, e.g. ``Fc3``.
+        name: name of the term's parameter, e.g. ``Fc3``.
         shape: a key of `SHAPES`.
         acts: pairs (torque row, motion), the motion as pairs (joint, weight); empty for a parameter without effect.
         settings: the numbers that the shape needs; an ``edge`` may be omitted.
         side: "link" or "motor" of a joint torque sensor; without such a sensor all terms are on the motor side.
-        linear: whether the joint is prismatic (units).
+        linear: whether the joint is prismatic, which decides the units.
     """
 
     name: str
@@ -55,7 +55,7 @@ class DriveTerm:
 
     @property
     def form(self) -> Shape:
-        """Properties of its shape."""
+        """Properties of the term's shape."""
         return SHAPES[self.shape]
 
     @property
@@ -73,15 +73,15 @@ class DriveTerm:
 
     @property
     def unit(self) -> str:
-        """Unit of its parameter."""
+        """Unit of the term's parameter."""
         return self.form.unit_linear if self.linear else self.form.unit
 
     def acting(self, motions: Sequence[np.ndarray | None], states: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-        """Yield each torque row that a term acts on, and the term's column in it (N,).
+        """Yield each torque row that the term acts on, and the term's column in this row (N,).
 
         Args:
-            motions: as in `fill`.
-            states: (s, N) of this term alone, see `friction_states`.
+            motions: q, v, a, load, as in `fill`.
+            states: (s, N) hysteresis states of this term alone, see `friction_states`.
         """
         for k, (row, motion) in enumerate(self.acts):
             state = states[k] if self.form.remembers else None
@@ -131,9 +131,9 @@ def standard(
     """Return the standard drive terms of n joints, joint after joint.
 
     Args:
-        sets: n strings of names out of Ia Fv Fc off (and Fvl Fcl offl, Fvm Fcm offm), e.g. ``["Ia Fv Fc"] * 6``.
-        v0: smoothing of the Coulomb sign [rad/s or m/s], one or per joint.
-        linear: which joints are prismatic.
+        sets: n strings of term names from Ia Fv Fc off (and Fvl Fcl offl, Fvm Fcm offm), e.g. ``["Ia Fv Fc"] * 6``.
+        v0: smoothing of the Coulomb sign [rad/s or m/s], one value or one per joint.
+        linear: (n,) which joints are prismatic; None: none.
     """
     shapes = STANDARD | LINK_SIDE | MOTOR_SIDE
     smoothing = np.broadcast_to(np.asarray(v0, dtype=float), (len(sets),))
@@ -153,7 +153,7 @@ def standard(
 
 
 def without_effect(label: str) -> tuple[DriveTerm, ...]:
-    """Return the seven drive parameters of a fixed body: the papers count them, they move nothing."""
+    """Return the seven drive parameters of a fixed body, which the papers count although they act on no torque."""
     shapes = {"Ia": "acceleration"} | LINK_SIDE | MOTOR_SIDE
     terms = []
     for name, shape in shapes.items():
@@ -166,11 +166,12 @@ def without_effect(label: str) -> tuple[DriveTerm, ...]:
 def coupled(
     first: int, second: int, v0: float = V0, label: str | None = None, weight: float = 1.0
 ) -> tuple[DriveTerm, ...]:
-    """Return Iam, Fvm, Fcm of a gear whose motor turns with q_first + weight q_second (the TX40 wrist: 4, 5, 1).
+    """Return Iam, Fvm, Fcm of a gear whose motor turns with q_first + weight q_second.
 
         tau_first += Iam a_second + Fvm v_second + Fcm sign(v_first + v_second), and the other way round
 
-    for a weight of 1 (Gautier & Janot's TX40 model; the joints' own Ia Fv Fc hold the rest); of -1: the difference.
+    for a weight of 1 (Gautier & Janot's TX40 model of the wrist, joints 4 and 5 counted from 0; the remaining inertia
+    and friction are in each joint's Ia, Fv, Fc). For a weight of -1, sums become differences.
     """
     if label is None:
         label = str(second + 1)
@@ -189,10 +190,10 @@ def fill(terms: Sequence[DriveTerm], out: np.ndarray, motions: Sequence[np.ndarr
     """Write the columns of terms into out (k, n, N), which must be zero.
 
     Args:
-        terms: k of them.
-        out: (k, n, N).
-        motions: q, v, a, load, each (n, N), load None if unknown.
-        states: (s, N), see `friction_states`.
+        terms: k drive terms.
+        out: (k, n, N) regressor columns.
+        motions: q, v, a, load, each (n, N), load None if no term needs it.
+        states: (s, N) states of friction with hysteresis, see `friction_states`.
     """
     first = 0
     for column, term in zip(out, terms, strict=True):
@@ -268,7 +269,7 @@ def _join(
 
 
 def _weighted(motion: Motion, series: np.ndarray) -> np.ndarray:
-    """Return the weighted sum (N,) of the joints' series (n, N); that of a single joint as it is, not a copy."""
+    """Return weighted sum (N,) of the joints' series (n, N); a single joint of weight 1 is returned without a copy."""
     if len(motion) == 1:
         joint, weight = motion[0]
         if weight == 1.0:
@@ -280,7 +281,7 @@ def _weighted(motion: Motion, series: np.ndarray) -> np.ndarray:
 
 
 def offered(step: str, joint: int, joint_range: RecordedRange, linear: bool = False) -> tuple[DriveTerm, ...]:
-    """Return the candidate terms of one joint in a step of the friction ladder, scaled by the joint's motion."""
+    """Return a joint's candidate terms in a step of the friction ladder, scaled by its recorded motion."""
     numbered = []
     for offer in STEPS[step]:
         for number, (end, settings) in enumerate(offer.settings(joint_range).items()):

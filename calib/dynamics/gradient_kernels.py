@@ -1,7 +1,7 @@
-"""Compiled derivatives (numba) of the regressor and of torques by q, v and a: reverse differentiation, by hand.
+"""Compiled derivatives (numba) of regressor and torques for q, v and a, by hand-written reverse differentiation.
 
-Arrays and notation are those of `calib.dynamics.kernels`, whose forward pass is undone here from the last body to the
-first.
+Arrays and notation are those of `calib.dynamics.kernels`, whose forward pass is differentiated here from the last body
+to the first.
 """
 
 import numpy as np
@@ -36,7 +36,8 @@ from calib.records import frozen
 def _share(links, order, i, weights, motion, twists, slopes, bars):
     """Add body i's part of the reverse pass: derivatives of Σ_j S_j · wrench_i(g_j), g_j = weights[j, body i].
 
-    ``slopes`` (B + 1, 9) belongs to w, dw, a; ``bars`` (B + 1, n, 6) to the twists.
+    ``slopes`` (B + 1, 9) are the derivatives with respect to w, dw, a; ``bars`` (B + 1, n, 6) those with respect to the
+    twists.
     """
     h = i + 1
     index = order[i]
@@ -144,7 +145,7 @@ def _uncarry(links, i, frames, twists, bars):
 
 @njit(**OPTIONS)
 def _back(links, hung, constants, v, frames, motion, twists, slopes, bars, gq, gv, ga):
-    """Add one sample's derivatives to gq, gv, ga (n,), from the last body on; `hung`: links that carry the twists."""
+    """Add one sample's derivatives to gq, gv, ga (n,), from the last body on; `hung`: links used for the twists."""
     for i in range(len(frames) - 1, -1, -1):
         c = links[i, COORDINATE]
         scale = constants[i, SCALE]
@@ -160,9 +161,9 @@ def _back(links, hung, constants, v, frames, motion, twists, slopes, bars, gq, g
 
 @njit(**OPTIONS)
 def regressor_gradient(links, constants, order, amount, cosine, sine, v, a, weights, gq, gv, ga):
-    """Add the gradients of Σ weights · Y(q, v, a), weights (N, n, 10 B), to gq, gv, ga (N, n), which start at 0.
+    """Add the gradients of Σ weights · Y(q, v, a), weights (N, n, 10 B), to gq, gv, ga (N, n), zero at first.
 
-    Reverse differentiation of the regressor, by hand: one forward pass, one pass back, O(n B) per sample.
+    Hand-written reverse differentiation of the regressor: one forward and one backward pass, O(n B) per sample.
     """
     bodies = amount.shape[1]
     n = v.shape[1]
@@ -189,7 +190,7 @@ def regressor_gradient(links, constants, order, amount, cosine, sine, v, a, weig
 
 
 def hung_on_one(links: np.ndarray) -> np.ndarray:
-    """Return links (B, 4 + n) with all bodies on one virtual joint without coordinate, for `torque_gradient`."""
+    """Return links (B, 4 + n) in which one virtual joint without coordinate carries all bodies (`torque_gradient`)."""
     chain = links.copy()
     chain[:, DEPTH] = 1
     chain[:, PATH] = 0
@@ -199,11 +200,11 @@ def hung_on_one(links: np.ndarray) -> np.ndarray:
 
 @njit(**OPTIONS)
 def torque_gradient(links, chain, constants, order, amount, cosine, sine, v, a, parameters, weights, gq, gv, ga):
-    """Add the gradients of Σ weights · tau(q, v, a), weights (N, n), to gq, gv, ga (N, n), which start at 0.
+    """Add the gradients of Σ weights · tau(q, v, a), weights (N, n), to gq, gv, ga (N, n), which must be zero at first.
 
-    `regressor_gradient` for weights of rank one: the joints' twists enter only as their weighted sum, so one virtual
-    joint, which every body hangs on (``chain``, `hung_on_one`), does for all of them: O(B) per sample. ``parameters``
-    (1, 10 B).
+    This is `regressor_gradient` for weights of rank one: the joints' twists enter only as their weighted sum, so a
+    single virtual joint that carries every body (``chain``, from `hung_on_one`) replaces all of them: O(B) per sample.
+    ``parameters`` are the standard parameters as a row (1, 10 B).
     """
     bodies = amount.shape[1]
     frames = np.empty((bodies, 12))

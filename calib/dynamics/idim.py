@@ -2,7 +2,7 @@
 
     tau = W(q, v, a) · chi,    chi = [standard parameters of every body; drive terms]
 
-Which torque rows those are, `TorqueRows` says.
+`TorqueRows` defines which torques the rows are (motors', joint torque sensors', or both).
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ KEPT_LAST = {"revolute": (3, 8, 9), "prismatic": (0, 1, 2, 3, 4, 5)}
 
 @dataclass(frozen=True, eq=False)
 class IdentificationModel:
-    """Regressor of bodies and drives.
+    """Inverse dynamic identification model: regressor of bodies and drives.
 
     Attributes:
-        bodies: of the robot.
-        terms: the drives' terms.
+        bodies: the robot's bodies, payloads included.
+        terms: drive terms (motor inertia, friction, offsets, couplings).
         torque_rows: torque rows that the model explains.
     """
 
@@ -68,7 +68,7 @@ class IdentificationModel:
 
     @property
     def inertial(self) -> int:
-        """Number of body parameters, the first columns."""
+        """Number of body parameters, which are the first columns."""
         return 10 * self.bodies.count if self.torque_rows.has_bodies else 0
 
     @property
@@ -85,13 +85,13 @@ class IdentificationModel:
 
     @property
     def columns(self) -> tuple[DriveTerm, ...]:
-        """Drive terms that affect these torque rows."""
+        """Drive terms that affect the model's torque rows."""
         sides = self.torque_rows.sides
         return tuple(term for term in self.terms if term.side in sides)
 
     @property
     def sides(self) -> tuple[str, ...]:
-        """Side of each column (p,) for `TorqueRows`."""
+        """Side of each of the p columns (``bodies``, ``link`` or ``motor``), as `TorqueRows` needs it."""
         term_sides = [term.side for term in self.columns]
         return (*([BODIES] * self.inertial), *term_sides)
 
@@ -115,14 +115,15 @@ class IdentificationModel:
         states: np.ndarray | None = None,
         link: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     ) -> np.ndarray:
-        """Return the regressor (N, rows, p), in the memory order (p, rows, N), which stacks without a copy.
+        """Return the regressor (N, rows, p); in memory it is ordered (p, rows, N), so that stacking needs no copy.
 
         Args:
-            q, v, a: (N, n) [rad or m, and per s, per s²].
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
             load: (N, n) transmitted torques [N m or N], where a friction term depends on them.
-            carried: labels of the fixed bodies (payloads) present; None for all. Columns of absent ones are zero.
-            states: (s, N), of `friction_states`; None: computed, taking q for one uninterrupted record.
-            link: q, v, a (N, n) of the bodies where joints deflect; None: those of the drives.
+            carried: labels of the fixed bodies (payloads) present; None: all. Columns of absent payloads are zero.
+            states: (s, N) states of friction with hysteresis, from `friction_states`; None: computed here, with q taken
+                as one uninterrupted record.
+            link: motion q, v, a (N, n) of the bodies, where joints deflect; None: that of the drives.
         """
         shape = (len(q), self.n)
         q = shaped(q, shape, "q")
@@ -147,9 +148,9 @@ class IdentificationModel:
         """Return the exact gradients of Σ weights · regressor(q, v, a) for q, v and a, (N, n) each, with all payloads.
 
         Args:
-            q, v, a: (N, n) [rad or m, and per s, per s²].
-            weights: (N, rows, c).
-            columns: (c,) of the regressor, which the weights are of, rising; None: all p.
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+            weights: (N, rows, c) weight of each regressor entry.
+            columns: (c,) ascending indices of the regressor columns that the weights refer to; None: all p.
         """
         if columns is None:
             columns = np.arange(self.p)
@@ -180,9 +181,9 @@ class IdentificationModel:
         """Return the gradients of Σ weights · (regressor values) for q, v and a, (N, n) each, with all payloads.
 
         Args:
-            q, v, a: (N, n) [rad or m, and per s, per s²].
-            values: (p,) of the parameters.
-            weights: (N, rows) of the torques.
+            q, v, a: (N, n) the motion [rad or m, and per s, per s²].
+            values: (p,) parameter values.
+            weights: (N, rows) weight of each torque.
         """
         side_weights = {}
         for side in set(self.sides):
@@ -205,7 +206,7 @@ class IdentificationModel:
     def acting(self) -> np.ndarray:
         """Return the mask (p, rows) of regressor entries that can differ from 0.
 
-        A body's parameters reach the joints before it, a drive's its own: half of all entries, or less.
+        A body's parameters act on the joints before it, a drive's on its own joint: half of all entries, or less.
         """
         if self.torque_rows.projection is not None:
             return np.ones((self.p, self.rows), dtype=bool)
@@ -233,7 +234,8 @@ class IdentificationModel:
     ) -> np.ndarray:
         """Return the torques (N, rows) of parameters (p,), by recursive Newton-Euler.
 
-        Friction that depends on the load feels the torque that the bodies, which move as `link`, need by the model.
+        For load-dependent friction, the load is the torque that the model gives for the bodies, which move as `link`.
+        Arguments as in `regressor`.
         """
         load, load_columns = None, None
         if self.inertial:
@@ -272,9 +274,9 @@ class IdentificationModel:
         return rigid_body.inverse_dynamics(self.bodies, parameters, q, v, a)
 
     def energy_columns(self, q: np.ndarray, v: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray:
-        """Return the energies h (N, p) per unit of each parameter, whose derivative is the power; zero for friction.
+        """Return the energy h (N, p) per unit of each parameter, whose time derivative is the power; zero for friction.
 
-        Bodies' are those of `rigid_body.energies`, a motor's inertia has ½ v², coupled ones v_i v_j.
+        Columns of bodies are from `rigid_body.energies`, a motor inertia's is ½ v², a coupled one's v_i v_j.
         """
         out = np.zeros((len(q), self.p))
         if self.inertial:
@@ -284,14 +286,14 @@ class IdentificationModel:
         return out
 
     def carried_columns(self, carried: Collection[str]) -> np.ndarray:
-        """Return factors (10 B,): one for parameters of bodies present, zero for those of absent payloads."""
+        """Return factors (10 B,) of the body parameters: zero for those of absent payloads, one for all others."""
         present = []
         for label, kind in zip(self.bodies.labels, self.bodies.kinds):
             present.append(kind != FIXED or label in carried)
         return np.repeat(np.array(present, dtype=float), 10)
 
     def preference(self) -> np.ndarray:
-        """Return the columns in order of preference: those Khalil keeps of moving links, drives, others, payloads."""
+        """Return the columns (p,) in order of preference: Khalil's choice on moving links, drives, others, payloads."""
         bodies = self.bodies
         kept_first: list[int] = []
         kept_last: list[int] = []
@@ -311,7 +313,7 @@ class IdentificationModel:
         return np.array([*kept_first, *drive_columns, *kept_last, *payloads], dtype=int)
 
     def load_cases(self) -> Loads:
-        """Return the load cases: all payloads and none, or only one case without payloads in the model."""
+        """Return the load cases: with all payloads and with none; a single case if the model has no payloads."""
         if self.inertial and np.any(self.bodies.kinds == FIXED):
             return (None, ())
         return (None,)
@@ -319,7 +321,7 @@ class IdentificationModel:
     def sample(
         self, count: int, rng: np.random.Generator, lower: np.ndarray | None = None, upper: np.ndarray | None = None
     ) -> States:
-        """Return random states: q uniform within its limits (default ±π), v, a uniform within ±3 per s and per s²."""
+        """Return `count` random states: q uniform within its limits (default ±π), v and a within ±3 [per s, per s²]."""
         if lower is None:
             lower = np.full(self.n, -np.pi)
         if upper is None:
@@ -330,7 +332,7 @@ class IdentificationModel:
         return States(q, v, a, load, rng.uniform(-1.0, 1.0, (state_count, count)))
 
     def _drop_absent(self, out: np.ndarray, carried: Collection[str] | None) -> None:
-        """Set the columns of absent payloads to zero."""
+        """Set the columns of absent payloads in `out` to zero."""
         if carried is None:
             return
         payloads = set()
@@ -369,10 +371,10 @@ def from_chain(
 
     Args:
         chain: the robot.
-        sets: names out of `drives.standard`, one string for all joints or n strings.
+        sets: names of standard drive terms (`drives.standard`), as one string for all joints or n strings.
         payload: (4, 4) frame of a payload in the last body's frame (`Chain.tail` for the tip); None for none.
         rows: torque rows that the model explains.
-        v0: smoothing of the Coulomb sign [rad/s or m/s], one or per joint.
+        v0: smoothing of the Coulomb sign [rad/s or m/s], one value or one per joint.
     """
     joint_sets = [sets] * chain.n if isinstance(sets, str) else list(sets)
     if len(joint_sets) != chain.n:
@@ -385,6 +387,6 @@ def from_chain(
 
 
 def friction_states(model: RegressorModel, q: np.ndarray) -> np.ndarray:
-    """Return the states (s, N) of friction with hysteresis along a gap-free record q (N, n), not cut into blocks."""
+    """Return states (s, N) of friction with hysteresis along an uninterrupted record q (N, n), not cut into blocks."""
     q = shaped(q, (None, model.n), "q")
     return drives.friction_states(model.columns, np.ascontiguousarray(q.T))

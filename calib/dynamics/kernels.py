@@ -1,13 +1,13 @@
 """Compiled rigid-body kernels (numba) on the arrays of `Bodies`: torques, regressor, inertia.
 
-Notation, all in body i's own frame: w angular velocity, dw its derivative, a acceleration of the frame's origin minus
+Notation, all in the frame of body i: w angular velocity, dw its derivative, a acceleration of the frame's origin minus
 gravity, (u_j, s_j) angular and linear velocity of the frame per unit rate of coordinate j. The wrench of body i,
 
     f = M a + dw × h + w × (w × h),    n = J dw + w × J w + h × a,
 
 J the inertia about the origin, h = [MX, MY, MZ] (Gautier & Khalil 1990), is linear in the parameters, and
 tau_j = Σ_i (u_j · n_i + s_j · f_i): the regressor needs no backward pass. Products and sums may be fused ("contract");
-nothing else of IEEE arithmetic is given up.
+otherwise IEEE arithmetic holds.
 
 ``links`` and ``constants`` are those of `Bodies` with B bodies and n coordinates: every frame is turned so that its
 joint's axis is z, and ``parameters`` (10 B) follow `Bodies.order`. Row 0 of ``motion`` and ``twists`` is the base, row
@@ -38,7 +38,7 @@ JOINED = {**OPTIONS, "forceinline": True}
 def sincos(x):
     """Return sine and cosine of abs(x) < 1e6 within 2e-16: polynomials of fdlibm (Sun, 1993), no branches.
 
-    A library call per value cannot be vectorised, and costs the regressor a third of its time.
+    Library calls, one per value, could not be vectorised and would take a third of the regressor's time.
     """
     n = (x * 0.6366197723675814 + ROUND) - ROUND
     r = ((x - n * 1.57079632673412561417) - n * 6.07710050630396597660e-11) - n * 2.02226624879595063154e-21
@@ -80,19 +80,19 @@ def place(links, constants, i, amount, cosine, sine, frames):
 
 @njit(**JOINED)
 def three(x, i, k):
-    """Return three numbers of row i from column k on: a vector is a tuple, which the compiler keeps in registers."""
+    """Return three numbers of row i from column k on, as a tuple, which the compiler keeps in registers."""
     return x[i, k], x[i, k + 1], x[i, k + 2]
 
 
 @njit(**JOINED)
 def write(x, i, k, a):
-    """Write a vector into row i from column k on."""
+    """Write vector `a` (3,) into row i of x, from column k on."""
     x[i, k], x[i, k + 1], x[i, k + 2] = a
 
 
 @njit(**JOINED)
 def increase(x, i, k, a):
-    """Add a vector to what stands in row i from column k on."""
+    """Add vector `a` (3,) to row i of x, from column k on."""
     write(x, i, k, add(three(x, i, k), a))
 
 
@@ -104,7 +104,7 @@ def add(a, b):
 
 @njit(**JOINED)
 def scaled(k, a):
-    """Return k a."""
+    """Return k · a."""
     return k * a[0], k * a[1], k * a[2]
 
 
@@ -125,7 +125,7 @@ def cross(a, b):
 
 @njit(**JOINED)
 def inertia_times(J, a):
-    """Return J a, J being XX, XY, XZ, YY, YZ, ZZ."""
+    """Return J a, J being the symmetric matrix of the six values XX, XY, XZ, YY, YZ, ZZ."""
     x = dot((J[0], J[1], J[2]), a)
     y = dot((J[1], J[3], J[4]), a)
     z = dot((J[2], J[4], J[5]), a)
@@ -134,7 +134,7 @@ def inertia_times(J, a):
 
 @njit(**JOINED)
 def turned(frames, i, a, k=0):
-    """Return R a, R being the matrix by rows in row i from column k on."""
+    """Return R a, R being the rotation matrix stored row by row in row i of `frames` from column k on."""
     x = dot(three(frames, i, k), a)
     y = dot(three(frames, i, k + 3), a)
     z = dot(three(frames, i, k + 6), a)
@@ -143,7 +143,7 @@ def turned(frames, i, a, k=0):
 
 @njit(**JOINED)
 def turned_back(frames, i, a, k=0):
-    """Return Rᵀ a."""
+    """Return Rᵀ a, with R as in `turned`."""
     x = scaled(a[0], three(frames, i, k))
     y = scaled(a[1], three(frames, i, k + 3))
     z = scaled(a[2], three(frames, i, k + 6))
@@ -152,7 +152,7 @@ def turned_back(frames, i, a, k=0):
 
 @njit(**JOINED)
 def ten_columns(w, e, a, u, s):
-    """Return a body's ten columns in the row of a coordinate with twist (u, s), from w, dw = e and a."""
+    """Return a body's ten regressor columns in the row of a coordinate with twist (u, s), from w, e = dw and a."""
     c = cross(u, w)
     xx = u[0] * e[0] + c[0] * w[0]
     xy = u[0] * e[1] + c[0] * w[1]
@@ -216,7 +216,7 @@ def carry(links, constants, i, frames, twists):
 
 @njit(**OPTIONS)
 def _place_lanes(constants, i, joint, turn):
-    """Write rotation (rows 0 to 8) and origin (9 to 11) of body i from cosine, sine and shift in `joint`."""
+    """Write rotation (rows 0 to 8) & origin (9 to 11) of body i into `turn`, from cosine, sine and shift in `joint`."""
     a0 = constants[i, 0]
     a1 = constants[i, 1]
     a2 = constants[i, 2]
@@ -249,7 +249,7 @@ def _place_lanes(constants, i, joint, turn):
 
 @njit(**JOINED)
 def _lane(x, r, k):
-    """Return the vector that sample k has in rows r to r + 2."""
+    """Return the vector of sample k, stored in rows r to r + 2 of x."""
     return x[r * L + k], x[(r + 1) * L + k], x[(r + 2) * L + k]
 
 
@@ -260,7 +260,7 @@ def _write_lane(x, r, k, a):
 
 @njit(**JOINED)
 def _lane_back(turn, k, a):
-    """Return Rᵀ a of sample k."""
+    """Return Rᵀ a for sample k, with its rotation R in `turn`."""
     x = scaled(a[0], _lane(turn, 0, k))
     y = scaled(a[1], _lane(turn, 3, k))
     z = scaled(a[2], _lane(turn, 6, k))
@@ -269,7 +269,7 @@ def _lane_back(turn, k, a):
 
 @njit(**OPTIONS)
 def _advance_lanes(turning, joint, turn, up, motion_here):
-    """`advance` for L samples, the joint about (turning 1) or along (turning 0) z."""
+    """Compute `advance` for L samples, for a joint that turns about z (turning 1) or slides along z (turning 0)."""
     f, g = turning, 2.0 - 2.0 * turning
     for k in range(L):
         w = _lane(up, 0, k)
@@ -290,7 +290,7 @@ def _advance_lanes(turning, joint, turn, up, motion_here):
 
 @njit(**OPTIONS)
 def _carry_lanes(turn, up, twist_here):
-    """`carry` of one coordinate's twist for L samples."""
+    """Compute the step of `carry` for the twist of one coordinate, for L samples."""
     for k in range(L):
         u = _lane(up, 0, k)
         _write_lane(twist_here, 0, k, _lane_back(turn, k, u))
@@ -300,7 +300,7 @@ def _carry_lanes(turn, up, twist_here):
 
 @njit(**OPTIONS)
 def _project_lanes(motion, twist, columns):
-    """Write the ten columns of one body in one coordinate's row for L samples."""
+    """Write the ten regressor columns of one body in one coordinate's row for L samples."""
     for k in range(L):
         w = _lane(motion, 0, k)
         e = _lane(motion, 3, k)
@@ -345,9 +345,9 @@ def regressor(links, constants, order, amount, v, a, out):
     L samples at a time, the sample index innermost, so that the compiler turns every line into vector instructions.
 
     Args:
-        order: (B, 10), `Bodies.order`: where the columns go.
-        amount: (B, N), each body's own motion, angles below 1e6.
-        v, a: (n, N).
+        order: (B, 10) `Bodies.order`, the position of each body's columns in `out`.
+        amount: (B, N) joint position that moves each body [rad or m], below 1e6.
+        v, a: (n, N) joint velocities and accelerations.
     """
     bodies = amount.shape[0]
     count = amount.shape[1]
@@ -392,7 +392,7 @@ def regressor(links, constants, order, amount, v, a, out):
 
 @njit(**OPTIONS)
 def _wrench(i, parameters, motion, wrench):
-    """Write force and moment of body i about its own frame's origin (row i of `wrench`, (B, 6))."""
+    """Write force and moment of body i about its frame's origin into row i of `wrench` (B, 6)."""
     w = three(motion, i + 1, 0)
     e = three(motion, i + 1, 3)
     a = three(motion, i + 1, 6)
@@ -408,7 +408,7 @@ def _wrench(i, parameters, motion, wrench):
 
 @njit(**OPTIONS)
 def _return(links, constants, i, frames, wrench, tau):
-    """Add body i's torque to tau (n,) and its wrench to the parent's."""
+    """Add body i's torque to tau (n,) and its wrench to its parent's (the backward step of Newton-Euler)."""
     c = links[i, COORDINATE]
     p = links[i, PARENT]
     if c >= 0:
@@ -427,7 +427,7 @@ def inverse_dynamics(links, constants, parameters, amount, cosine, sine, v, a, o
     """Fill out (N, n), initially zero, with the torques (recursive Newton-Euler; Luh, Walker, Paul 1980).
 
     Args:
-        amount, cosine, sine: (N, B), each body's own motion.
+        amount, cosine, sine: (N, B) joint position that moves each body [rad or m], its cosine and sine.
     """
     bodies = amount.shape[1]
     frames = np.empty((bodies, 12))
@@ -453,7 +453,7 @@ def inverse_dynamics(links, constants, parameters, amount, cosine, sine, v, a, o
 
 @njit(**OPTIONS)
 def stop(x, width):
-    """Return the states (N,) of a stop operator driven by x (N,), unstressed at first."""
+    """Return the states (N,) of a stop operator of half-width `width` driven by x (N,), unstressed at first."""
     out = np.zeros(x.shape[0])
     for k in range(1, x.shape[0]):
         free = out[k - 1] + (x[k] - x[k - 1]) / width

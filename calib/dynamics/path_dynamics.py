@@ -4,9 +4,9 @@
     Γ = w(Φ, 0, 0) X,    B = w(Φ, Φ', Φ'') X - Γ,    A = w(Φ, Φ', Φ' + Φ'') X - B - Γ = w(Φ, 0, Φ') X - Γ
 
 (Kolyubin, Shiriaev, Jubien 2019, Proposition 1, eq. 29 to 32), so A = M Φ', B = M Φ'' + C(Φ, Φ') Φ' and Γ = G without
-any of M, C, G. X are the parameters without friction (Remark 2 there): motor inertia Ia belongs to M where tau is the
-motors' torque, and a torque offset or a spring to Γ. Every term that depends on speed is friction f: Coulomb's is a
-sign that the direction of Φ' decides, viscous friction goes with ṡ, which is not affine in ṡ².
+computing M, C or G. X are the parameters without friction (their Remark 2): motor inertia Ia belongs to M where tau is
+the motors' torque, and a torque offset or a spring to Γ. Every term that depends on speed is friction f: Coulomb
+friction depends on the sign of Φ', viscous friction is proportional to ṡ, which is not affine in ṡ².
 """
 
 from collections.abc import Callable, Sequence
@@ -26,13 +26,13 @@ Regressor = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class PathDynamics:
-    """A model with parameter values, friction separate from the rest.
+    """Dynamics along a path: a model with parameter values, friction separate from all other torques.
 
     Attributes:
-        regressor: maps q, v, a (N, n) to (N, rows, b); the last n rows are the limited torques.
-        parameters: (b,) X, zero for friction.
-        terms, amounts: all drive terms and their (k,) values; Coulomb's sign is the exact one.
-        bodies, inertial: bodies and their (10 B,) parameters.
+        regressor: function that maps q, v, a (N, n) to (N, rows, b); the last n rows are the limited torques.
+        parameters: (b,) X of the module docstring, zero for friction.
+        terms, amounts: all drive terms, with the exact Coulomb sign, and their values (k,).
+        bodies, inertial: bodies and their standard parameters (10 B,).
     """
 
     regressor: Regressor
@@ -93,7 +93,7 @@ class PathDynamics:
         a: np.ndarray,
         load: np.ndarray | None,
     ) -> np.ndarray:
-        """Return the torques (N, n) of some drive terms with values (k,)."""
+        """Return the torques (N, n) of drive terms with values (k,); `load` (N, n) transmitted torques, or None."""
         motions: list[np.ndarray | None] = [np.ascontiguousarray(series.T) for series in (q, v, a)]
         motions.append(None if load is None else load.T)
         columns = np.zeros((len(terms), self.n, len(q)))
@@ -130,7 +130,7 @@ def of_standard(model: IdentificationModel, values: np.ndarray) -> PathDynamics:
 
 
 def _with_exact_sign(term: DriveTerm) -> DriveTerm:
-    """Return the term with the exact, unsmoothed Coulomb sign: the larger torque at low speed."""
+    """Return the term with the exact Coulomb sign in place of the smoothed one, which is smaller at low speed."""
     settings = []
     for name, setting in zip(term.form.settings, term.settings):
         settings.append(0.0 if name == "v0" else setting)
@@ -138,7 +138,7 @@ def _with_exact_sign(term: DriveTerm) -> DriveTerm:
 
 
 def _stressed(terms: Sequence[DriveTerm], v: np.ndarray) -> np.ndarray:
-    """Return states (s, N) of stop operators that slide in the direction of their motion; v (n, N)."""
+    """Return the states (s, N) of stop operators that slide in the direction of motion, given v (n, N)."""
     count = v.shape[1]
     states = []
     for term in terms:

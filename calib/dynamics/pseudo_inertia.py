@@ -3,9 +3,9 @@
     P = [ Σ   h ]        Σ = ½ tr(I) 1 - I = ∫ x xᵀ dm,    h = ∫ x dm = (MX MY MZ),    m = ∫ dm,
         [ hᵀ  m ]
 
-about the link frame's origin. P ≻ 0 says that some density of mass ≥ 0 has these ten parameters, no more and no less
-(Wensing, Kim & Slotine 2018, theorem 1): mass above zero, and the triangle inequality of the moments about the centre.
-The map is linear and one to one, so the ten parameters of a body are a point of the cone of 4×4 matrices.
+about the link frame's origin. P ≻ 0 if and only if some density of mass ≥ 0 has these ten parameters (Wensing, Kim &
+Slotine 2018, theorem 1): mass above zero, and the triangle inequality of the moments about the centre of mass. The map
+is linear and one to one, so the ten parameters of a body are a point of the cone of 4×4 matrices.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ def from_standard(parameters: np.ndarray) -> np.ndarray:
 
 
 def to_standard(pseudo: np.ndarray) -> np.ndarray:
-    """Return the standard parameters (…, 10) of P (…, 4, 4): I = tr(Σ) 1 - Σ."""
+    """Return the standard parameters (…, 10) of pseudo-inertias P (…, 4, 4), with the inertia I = tr(Σ) 1 - Σ."""
     pseudo = np.asarray(pseudo, dtype=float)
     second = pseudo[..., :3, :3]
     trace = np.trace(second, axis1=-2, axis2=-1)
@@ -32,10 +32,12 @@ def to_standard(pseudo: np.ndarray) -> np.ndarray:
 
 
 def margin(parameters: np.ndarray) -> float:
-    """Return the margin of physical consistency [m]: root of the smallest eigenvalue of Σ / mass about the centre.
+    """Return the margin of physical consistency [m].
 
-    It is the standard deviation of the mass in its thinnest direction (t / √12 for a plate of thickness t); negative
-    for an impossible body; -inf if the mass is not positive.
+    The root of the smallest eigenvalue of Σ / mass about the centre of mass.
+
+    This is the standard deviation of the mass in the body's thinnest direction (t / √12 for a plate of thickness t);
+    negative for a physically inconsistent inertia; -inf if the mass is not positive.
     """
     pseudo = from_standard(parameters)
     mass = pseudo[3, 3]
@@ -50,7 +52,7 @@ def margin(parameters: np.ndarray) -> float:
 def divergence(pseudo: np.ndarray, reference: np.ndarray) -> float:
     """Return the entropic divergence tr(P₀⁻¹ P) - log det(P₀⁻¹ P) - 4 of P from P₀ (Lee, Wensing & Park 2020).
 
-    Zero only at P = P₀, infinite at the boundary, independent of frame and units.
+    The divergence is zero only at P = P₀, infinite at the boundary, independent of frame and units.
     """
     ratio = np.linalg.solve(reference, pseudo)
     sign, log_det = np.linalg.slogdet(ratio)
@@ -60,7 +62,7 @@ def divergence(pseudo: np.ndarray, reference: np.ndarray) -> float:
 
 
 def ball(mass: float, radius: float, centre: np.ndarray | None = None) -> np.ndarray:
-    """Return the ten parameters of a homogeneous ball [kg, m] about the link frame."""
+    """Return ten standard parameters about the link frame of a homogeneous ball (mass [kg], radius and centre [m])."""
     if centre is None:
         centre = np.zeros(3)
     centre = np.asarray(centre, dtype=float)
@@ -74,7 +76,7 @@ def ball(mass: float, radius: float, centre: np.ndarray | None = None) -> np.nda
 
 
 def rod(mass: float, end: np.ndarray, radius: float) -> np.ndarray:
-    """Return the ten parameters of a uniform rod from the origin to `end`, with the thickness of a ball of `radius`."""
+    """Return the ten parameters of a uniform rod from the origin to `end` [m], as thick as a ball of `radius`."""
     end = np.asarray(end, dtype=float)
     pseudo = from_standard(ball(mass, radius, end / 2.0))
     pseudo[:3, :3] += mass * np.outer(end, end) / 12.0
@@ -82,7 +84,7 @@ def rod(mass: float, end: np.ndarray, radius: float) -> np.ndarray:
 
 
 def _basis() -> np.ndarray:
-    """Return (10, 4, 4): P of each unit parameter."""
+    """Return the pseudo-inertia P of each of the ten unit parameters (10, 4, 4)."""
     basis = np.zeros((10, 4, 4))
     for k, (row, column) in enumerate(SYMMETRIC):
         basis[k, row, column] -= 1.0
@@ -111,7 +113,10 @@ BASIS, UNITS = _basis(), _units()
 
 
 def unknown_bodies(count: int, term_count: int) -> np.ndarray:
-    """Return P of bodies linear in unknowns (count, 4, 4, 10 count + terms): ten per body in `UNITS`, then terms."""
+    """Return the P of each body as a linear function of all unknowns, (count, 4, 4, 10 count + terms).
+
+    The unknowns are ten coordinates in `UNITS` per body, followed by the drive terms, on which P does not depend.
+    """
     bodies = np.einsum("ij,krs->irsjk", np.eye(count), UNITS)
     bodies = bodies.reshape(count, 4, 4, 10 * count)
     terms = np.zeros((count, 4, 4, term_count))

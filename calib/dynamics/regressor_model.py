@@ -1,8 +1,8 @@
 """Interface of models for identification: torques as a linear function of parameters, W(q, v, a) x = y.
 
-A serial chain meets it (`calib.dynamics.idim.IdentificationModel`), and so may anything whose torques are linear in its
-parameters: a closed chain reduced to its actuated coordinates, a model of the power alone. What only a serial chain
-knows (limits of its joints, masses of its CAD, another geometry) goes to identification beside it.
+A serial chain implements the interface (`calib.dynamics.idim.IdentificationModel`), and so can any model whose torques
+are linear in its parameters: a closed chain reduced to its actuated coordinates, a model of the power alone. Properties
+that only a serial chain has (joint limits, CAD masses, another geometry) are passed to identification separately.
 """
 
 from collections.abc import Collection, Sequence
@@ -23,8 +23,8 @@ class States:
 
     Attributes:
         q, v, a: (N, n) [rad or m, and per s, per s²].
-        load: (N, n) transmitted torques, where a friction term depends on them.
-        states: (s, N) of `idim.friction_states`, where a friction term remembers.
+        load: (N, n) transmitted torques [N m or N], needed where friction depends on them; None otherwise.
+        states: (s, N) from `idim.friction_states`, needed where friction depends on past motion; None otherwise.
     """
 
     q: np.ndarray
@@ -35,7 +35,7 @@ class States:
 
 
 class RegressorModel(Protocol):
-    """Interface of a model with n recorded coordinates and p parameters, first of bodies, then of drive terms."""
+    """Interface of a model with n recorded coordinates and p parameters: first of bodies, then of drive terms."""
 
     @property
     def n(self) -> int:
@@ -62,7 +62,7 @@ class RegressorModel(Protocol):
 
     @property
     def columns(self) -> tuple[DriveTerm, ...]:
-        """Drive terms of the other parameters (p - inertial,)."""
+        """Drive terms of the last p - inertial parameters."""
         ...
 
     @property
@@ -96,7 +96,7 @@ class RegressorModel(Protocol):
         carried: Collection[str] | None = None,
         states: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Return the torques (N, rows) of parameters (p,): W · values, or faster."""
+        """Return the torques (N, rows) of parameters (p,): W · values, possibly by a faster algorithm."""
         ...
 
     def acting(self) -> np.ndarray:

@@ -1,8 +1,8 @@
-"""Regressor, torques and inertia matrix of a `Bodies` in batch: shape checks around the kernels.
+"""Regressor, torques and inertia matrix of `Bodies` for many samples at once: checks of shapes, then the kernels.
 
     tau = Y(q, v, a) · chi,    chi the standard parameters XX XY XZ YY YZ ZZ MX MY MZ M, body after body.
 
-A static arm's drives show +g(q). numba is imported at the first call, not before.
+Sign: the drives of an arm at rest exert +g(q). numba is imported at the first call, not before.
 """
 
 import numpy as np
@@ -29,7 +29,7 @@ def regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np
 
 
 def fill_regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray, out: np.ndarray) -> None:
-    """Write the regressor into out (10 B, n or more, N), initially zero; q, v, a (N, n) must be checked."""
+    """Write the regressor into out (10 B, n or more, N), initially zero; q, v, a (N, n) are not checked here."""
     from calib.dynamics import kernels
 
     coordinates = q.T[bodies.coordinates]
@@ -50,7 +50,7 @@ def energies(bodies: Bodies, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     (Gautier 1997, with Y the regressor of the torques, so that M(q) q̇ = [Y(q, 0, q̇) - Y(q, 0, 0)] chi.)
 
     Args:
-        bodies: of the robot.
+        bodies: the robot's bodies.
         q, v: (N, n) [rad or m, and per s].
     """
     zero = np.zeros_like(np.asarray(v, dtype=float))
@@ -67,7 +67,7 @@ def energies(bodies: Bodies, q: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def _frames(bodies: Bodies, q: np.ndarray) -> np.ndarray:
-    """Return the bodies' frames in the base, (B, N, 4, 4)."""
+    """Return the poses of the bodies' frames in the base frame, (B, N, 4, 4)."""
     frames = np.empty((bodies.count, len(q), 4, 4))
     for body, parent in enumerate(bodies.parents):
         placement = bodies.placements[body]
@@ -99,8 +99,8 @@ def regressor_gradient(
     """Return the exact gradients of Σ weights · Y(q, v, a) with respect to q, v and a, three arrays (N, n).
 
     Args:
-        weights: (N, n, 10 B); rank one, ``weights[k] = outer(lambda_k, chi)``, gives the derivatives of
-            Σ lambda · tau, so the gradient of any function of Y costs one call.
+        weights: (N, n, 10 B); weights of rank one, ``weights[k] = outer(lambda_k, chi)``, give the derivatives of Σ
+            lambda · tau. The gradient of any function of Y needs one call.
     """
     from calib.dynamics import gradient_kernels
 
@@ -122,7 +122,7 @@ def torque_gradient(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the exact gradients of Σ weights · tau(q, v, a), weights (N, n), for q, v and a, three arrays (N, n).
 
-    As `regressor_gradient` with weights of rank one, at a fraction of its cost.
+    Equals `regressor_gradient` with weights of rank one, at a fraction of the cost.
 
     Args:
         parameters: (10 B,) standard parameters.
@@ -149,7 +149,7 @@ def inverse_dynamics(bodies: Bodies, parameters: np.ndarray, q: np.ndarray, v: n
     """Return the rigid-body torques (N, n) [N m or N]: no motor inertia, no friction.
 
     Args:
-        parameters: (10 B,) standard ones; any values, also those of no possible body.
+        parameters: (10 B,) standard parameters; they need not be physically consistent.
     """
     from calib.dynamics import kernels
 
@@ -195,12 +195,12 @@ def _states(bodies: Bodies, **arrays: np.ndarray) -> list[np.ndarray]:
 
 
 def _plain(array: np.ndarray) -> np.ndarray:
-    """Return an array in C-contiguous, writable memory, without copy if possible."""
+    """Return the array in C-contiguous, writable memory, without a copy if possible."""
     return np.require(array, requirements=["C", "W"])
 
 
 def _placed(bodies: Bodies, q: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return each body's joint position, its cosine and sine (N, B), vectorised by numpy."""
+    """Return the joint position that moves each body, its cosine and sine, (N, B) each."""
     # Not q[:, …], which is laid out by columns.
     amount = q.take(bodies.coordinates, axis=1) * bodies.scales
     return amount, np.cos(amount), np.sin(amount)

@@ -1,7 +1,7 @@
 """Compiled shapes of friction and other drive torques (numba): one formula with derivatives for arrays and simulations.
 
-A shape's settings stand in one row of `acts`, from column 1 on, in the order of `calib.dynamics.shapes.SHAPES`; the
-other columns are the simulator's. The code of a shape is the constant of its name.
+One row of `acts` holds a shape's settings, from column 1 on, in the order of `calib.dynamics.shapes.SHAPES`; the
+simulator uses the other columns. The code of a shape is the constant named after it.
 """
 
 from math import cos, exp, isinf, pi, sin, sqrt, tanh
@@ -35,7 +35,7 @@ def smooth_sign(v, v0):
 
 @njit(**JOINED)
 def _sign_slope(sign, v0):
-    """Return the derivative of `smooth_sign` by v, from its value."""
+    """Return the derivative of `smooth_sign` with respect to v, given its value `sign`."""
     return (1.0 - sign * sign) / v0 if v0 > 0.0 else 0.0
 
 
@@ -43,7 +43,7 @@ def _sign_slope(sign, v0):
 def _band(acts, t, x, v):
     """Return the gain of ripple in one band and one direction: triangular over the frequency order · |v| / 2π [Hz].
 
-    It decreases to zero within `FADE` beyond the positions of the identification, lower … upper.
+    The gain decreases to zero within `FADE` beyond the range of positions of the identification, lower … upper.
     """
     left = acts[t, 2]
     middle = acts[t, 3]
@@ -64,10 +64,10 @@ def shape(code, acts, t, x, v, state):
     """Return the value of a shape per unit parameter, and its derivatives with respect to position and velocity.
 
     Args:
-        code: which shape.
-        acts, t: its settings.
+        code: code of the shape.
+        acts, t: array of settings, and the row of this shape in it.
         x, v: position and velocity [rad or m, per s].
-        state: of the stop operator, see `calib.dynamics.drives.friction_states`.
+        state: state of the stop operator, see `calib.dynamics.drives.friction_states`.
     """
     first = acts[t, 1]
     second = acts[t, 2]
@@ -124,7 +124,7 @@ def shape(code, acts, t, x, v, state):
 
 @njit(**OPTIONS)
 def steepest(code, acts, t):
-    """Return a smoothed sign's largest slope, the |v| where it occurs, its width, and the stiffness of a stop."""
+    """Return a smoothed sign's largest slope, the |v| where it occurs, its width in v, and a stop's stiffness."""
     first = acts[t, 1]
     second = acts[t, 2]
     third = acts[t, 3]
@@ -145,7 +145,7 @@ def steepest(code, acts, t):
 
 @njit(**OPTIONS)
 def fill(code, acts, x, v, state, out):
-    """Write the values of one shape into out (1, N); for out (3, N) also the derivatives for position and velocity."""
+    """Write the values of one shape into out (1, N); if out is (3, N), also its derivatives with respect to x and v."""
     for k in range(v.shape[0]):
         value, by_x, by_v = shape(code, acts, 0, x[k], v[k], state[k])
         out[0, k] = value

@@ -1,15 +1,15 @@
 """Shapes of drive torques: one row per shape; formulas and derivatives are in `calib.dynamics.shape_kernels`.
 
 A shape sees x, v, a [rad or m, per s, per s²] of one joint (or of a sum of joints, where a gear couples them), the
-torque the joint transmits, and its settings; it says by how much the torque changes per unit of its parameter. To add
-one: a row here (and in `STEPS`, if the ladder of friction is to try it), and its formula with a code there; arrays,
+torque the joint transmits, and its settings; its value is the torque per unit of its parameter. To add a shape: a row
+here (and in `STEPS`, if the friction ladder is to try it), and its formula with a code in `shape_kernels`; arrays,
 simulator, tangents and option files follow from both.
 
-The Coulomb sign is smoothed as s(v) = tanh(v / v0) (v0 = 0: the exact sign; BIRDy's choice is v0 = 0.01 rad/s). It is
-a dead-zone sign where the shape is called ``dead``: 0 where abs(v) <= v0.
+The Coulomb sign is smoothed as s(v) = tanh(v / v0) (v0 = 0: the exact sign; BIRDy's choice is v0 = 0.01 rad/s). In
+shapes called ``dead`` the sign has a dead zone instead: 0 where abs(v) <= v0.
 
-Shapes that bend keep their value beyond an ``edge`` [rad/s or m/s], the fastest that they were identified at (infinite
-where it is not given): beyond it, friction goes on linearly.
+Shapes that are nonlinear in speed keep their value beyond an ``edge`` [rad/s or m/s], the fastest speed of their
+identification (infinite where it is not given): beyond the edge, friction continues linearly.
 """
 
 import math
@@ -31,7 +31,7 @@ STRIBECK_SHARES = {"": 0.05, ".2": 0.2}
 
 @dataclass(frozen=True)
 class TermMotion:
-    """Motion of one term, each (N,); `load` [N m or N] and `state` are None if not needed."""
+    """Motion that one drive term depends on, each (N,); `load` [N m or N] and `state` are None if not needed."""
 
     x: np.ndarray
     v: np.ndarray
@@ -45,9 +45,9 @@ class RecordedRange:
     """Ranges of a joint's recorded motion, which scale its terms.
 
     Attributes:
-        v0: smoothing of its Coulomb sign [rad/s or m/s].
-        peak, edge: speed that it hardly passes, and fastest speed [rad/s or m/s].
-        travel: from end to end [rad or m].
+        v0: smoothing of the joint's Coulomb sign [rad/s or m/s].
+        peak, edge: speed that the joint rarely exceeds, and its fastest speed [rad/s or m/s].
+        travel: distance between the extreme positions [rad or m].
     """
 
     v0: float
@@ -61,16 +61,18 @@ class Shape:
     """One shape of drive torque and its properties.
 
     Attributes:
-        unit: of the parameter for a revolute joint, and `unit_linear` for a prismatic one.
-        settings: names of the numbers it needs, with units; ``v0`` smooths Coulomb's sign.
-        slopes: whether it has derivatives (none if it depends on past motion or torques).
-        loaded, remembers: whether it needs `TermMotion.load`, `TermMotion.state`.
-        friction: whether it depends on speed; else a motion along a path is affine in it.
-        dissipative: whether it is friction, which dissipates energy for a positive parameter.
-        of_velocity: whether it is a function of v alone (a constant is one).
-        nonnegative: whether its parameter is above zero in every robot: inertia, viscous and Coulomb friction.
-        exact: whether its columns are free of the noise of q, v and a: ones, and signs but for reversals.
-        undecided_at_rest: whether it is friction that a speed, however small, decides: of a standing joint unknown.
+        unit: unit of the parameter for a revolute joint; `unit_linear` is that for a prismatic joint.
+        settings: names of the numbers that the shape needs, with units; ``v0`` smooths Coulomb's sign.
+        slopes: whether the shape has derivatives (none if it depends on past motion or torques).
+        loaded, remembers: whether the shape needs `TermMotion.load` and `TermMotion.state`.
+        friction: whether the shape depends on speed; if not, its torque along a path is affine in s̈ and ṡ².
+        dissipative: whether the shape dissipates energy for a positive parameter.
+        of_velocity: whether the shape is a function of v alone (a constant counts as one).
+        nonnegative: whether the parameter is positive in every robot: inertia, viscous and Coulomb friction.
+        exact: whether the shape's columns are free of the noise of q, v and a: constants, and signs except at
+            reversals.
+        undecided_at_rest: whether the shape depends on the sign of the speed, so that its value is unknown for a joint
+            at rest.
     """
 
     unit: str
@@ -114,7 +116,10 @@ SHAPES: dict[str, Shape] = {
 
 
 class Offer(NamedTuple):
-    """Candidate terms of a joint in a step of the friction ladder: names ``label + joint + end``, settings by end."""
+    """Candidate terms of a joint in a step of the friction ladder.
+
+    A term's name is ``label + joint + ending``; `settings` returns, for a joint's range, the settings of each ending.
+    """
 
     label: str
     shape: str
@@ -123,7 +128,7 @@ class Offer(NamedTuple):
 
 
 def _presliding(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
-    """Return candidate stop operators of several widths, each z - sign(v), so that Fc stays the friction of sliding."""
+    """Return candidate stop operators of several widths, each as z - sign(v): Fc remains the friction of sliding."""
     return {f".{k}": (share * joint.travel, joint.v0) for k, share in enumerate(PRESLIDING_SHARES, 1)}
 
 
@@ -143,12 +148,12 @@ def _smoothed(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
 
 
 def _up_to_edge(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
-    """Return one candidate that keeps its value beyond the fastest speed."""
+    """Return one candidate whose value is constant beyond the joint's fastest speed."""
     return {"": (joint.edge,)}
 
 
 def _root(joint: RecordedRange) -> dict[str, tuple[float, ...]]:
-    """Return one candidate that keeps its value beyond the fastest speed, smoothed at rest."""
+    """Return one candidate whose value is constant beyond the joint's fastest speed, smoothed at rest."""
     return {"": (joint.edge, joint.v0)}
 
 

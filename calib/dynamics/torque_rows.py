@@ -1,14 +1,14 @@
-"""Torque rows that a model explains: a linear map of the joints' torques, of regressors and of measured torques alike.
+"""Torque rows that a model explains: a linear map of joint torques, for regressors and measured torques.
 
 With torque sensors in the joints (Kolyubin, Shiriaev, Jubien 2019, section 6.2) four kinds of rows exist:
 
     MOTOR   tau             bodies and all drive terms (a robot without such sensors)
     LINK    tau_l           Model 1: bodies and link-side terms
-    BOTH    [tau_l; tau]    Model 2: bodies and link-side terms in both, motor-side terms in the second half
+    BOTH    [tau_l; tau]    Model 2: bodies and link-side terms in both halves, motor-side terms in the second
     DRIVE   tau - tau_l     Model 3: motor-side terms alone
 
-`projected` makes others of them: torques on the actuated or platform coordinates of a closed chain, Gᵀ tau, or the
-power alone, vᵀ tau (`power`).
+`projected` makes further kinds of rows from these: torques on the actuated or platform coordinates of a closed chain,
+Gᵀ tau, or the power alone, vᵀ tau (`power`).
 """
 
 from collections.abc import Callable, Sequence
@@ -31,10 +31,10 @@ class _JointBlock:
     """One torque row per joint.
 
     Attributes:
-        prefix: of the rows' labels.
-        sides: which columns act on them: ``bodies``, drive terms of the ``link`` side, of the ``motor`` side.
-        motor, sensor: the measured torques they are: motor · tau + sensor · tau_l.
-        suffix: of their names, which are a joint's otherwise.
+        prefix: prefix of the rows' labels.
+        sides: which columns act on the rows: ``bodies``, drive terms of the ``link`` side, drive terms of the ``motor``
+        side. motor, sensor: factors of the measured torques in a row: motor · tau + sensor · tau_l.
+        suffix: suffix of the rows' full names, after the joint's name.
     """
 
     prefix: str
@@ -49,9 +49,10 @@ class Projection:
     """A linear map of joint rows, which may depend on the state.
 
     Attributes:
-        labels, units: of the rows that it makes.
-        torques: q, v (N, n) of the motion to (N, rows, k): from the k joint rows of a regressor.
-        measured: q, v of the motion to (N, rows, k): from the k measured torques; None: as `torques`.
+        labels, units: labels and units of the projected rows.
+        torques: function of q, v (N, n) that returns the map (N, rows, k) applied to the k joint rows of a regressor.
+        measured: function of q, v (N, n) that returns the map (N, rows, k) applied to the k measured torques; None:
+            `torques`.
     """
 
     labels: tuple[str, ...]
@@ -66,8 +67,9 @@ class TorqueRows:
 
     Attributes:
         name: name in options and files.
-        blocks: one row per joint each.
-        drives: standard drive terms of a joint that such rows distinguish (`calib.dynamics.drives.standard`).
+        blocks: blocks of rows, each with one row per joint.
+        drives: names of the standard drive terms of a joint that these rows can identify
+            (`calib.dynamics.drives.standard`).
         projection: a map of the blocks' rows; None: the blocks themselves.
     """
 
@@ -78,7 +80,7 @@ class TorqueRows:
 
     @property
     def sides(self) -> frozenset[str]:
-        """Sides of the columns that affect any row."""
+        """Sides of the columns that affect any row: ``bodies``, ``link``, ``motor``."""
         return frozenset().union(*(block.sides for block in self.blocks))
 
     @property
@@ -108,23 +110,23 @@ class TorqueRows:
         return self.projection is None and block.motor == 1.0 and block.sensor == 0.0 and BODIES in block.sides
 
     def count(self, n: int) -> int:
-        """Return the rows per sample of n joints."""
+        """Return the number of rows per sample for n joints."""
         if self.projection is not None:
             return len(self.projection.labels)
         return n * len(self.blocks)
 
     def of_side(self, side: str, joint: int, n: int) -> list[int]:
-        """Return the rows of one of n joints affected by a drive term on the ``link`` or ``motor`` side."""
+        """Return the rows affected by a drive term of one of n joints, on the ``link`` or ``motor`` side."""
         return [k * n + joint for k, block in enumerate(self.blocks) if side in block.sides]
 
     def labels(self, joints: Sequence[str]) -> tuple[str, ...]:
-        """Return the row labels in tables, given the joint labels."""
+        """Return the labels of the rows in tables, given the joint labels."""
         if self.projection is not None:
             return self.projection.labels
         return tuple(block.prefix + joint for block in self.blocks for joint in joints)
 
     def numbered(self, n: int) -> tuple[str, ...]:
-        """Return the row labels for joints numbered 1 to n."""
+        """Return the labels of the rows for joints numbered 1 to n."""
         return self.labels([str(number) for number in range(1, n + 1)])
 
     def titles(self, joints: Sequence[str]) -> tuple[str, ...]:
@@ -141,7 +143,7 @@ class TorqueRows:
         return tuple(joint_units * len(self.blocks))
 
     def of_joints(self, mask: np.ndarray) -> np.ndarray:
-        """Return flags of rows (N, rows) from flags of joints (N, n): those of all joints for projected rows."""
+        """Return flags of rows (N, rows) from flags of joints (N, n); projected rows: where all joints are flagged."""
         if self.projection is not None:
             of_sample = mask.all(axis=1, keepdims=True)
             return np.repeat(of_sample, len(self.projection.labels), axis=1)
@@ -151,9 +153,9 @@ class TorqueRows:
         """Return the rows (N, rows, p) for columns of joint torques (N, n, p), in the columns' memory order.
 
         Args:
-            torques: regressor of the n joints, or torques themselves as columns.
-            sides: (p,) of the columns: ``bodies``, ``link`` or ``motor``.
-            q, v: (N, n) of the motion.
+            torques: regressor of the n joint torques, or joint torques themselves as columns.
+            sides: (p,) side of each column: ``bodies``, ``link`` or ``motor``.
+            q, v: (N, n) the motion [rad or m, and per s].
         """
         if len(self.blocks) == 1 and set(sides) <= self.sides:
             return self._projected(torques, q, v)
@@ -163,7 +165,7 @@ class TorqueRows:
         return self.observe_in_place(columns, sides, q, v)
 
     def observe_in_place(self, columns: np.ndarray, sides: Sequence[str], q: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return the rows as `observe` from columns (p, n per block, N): joint torques in the first n rows, else zero.
+        """Return the rows, as `observe`, from columns (p, n per block, N): torques in the first n rows, zero in others.
 
         The columns are overwritten, to avoid a copy of a large regressor.
         """
@@ -187,10 +189,10 @@ class TorqueRows:
         return self.projection.torques(q, v) @ torques
 
     def fold(self, weights: np.ndarray, sides: Sequence[str]) -> np.ndarray:
-        """Return the adjoint of `observe`: weights of rows (N, rows, p) as those of joint torques (N, n, p).
+        """Return the adjoint of `observe`: weights of rows (N, rows, p) turned into weights of joint torques (N, n, p).
 
         Raises:
-            CalibError: for rows with a projection, whose own dependence on the state it would leave out.
+            CalibError: for rows with a projection, whose derivative with respect to the state would be missing.
         """
         if self.projection is not None:
             raise CalibError(f"rows '{self.name}' use a projection that depends on the state: no derivatives")
@@ -209,9 +211,9 @@ class TorqueRows:
         """Return the measured torques of the rows (N, rows).
 
         Args:
-            motor: (N, n) the motors' torques.
-            sensor: (N, n) of sensors on the link side of the gears; None without sensors.
-            q, v: (N, n) of the motion.
+            motor: (N, n) the motors' torques [N m or N].
+            sensor: (N, n) torques of sensors on the link side of the gears; None without sensors.
+            q, v: (N, n) the motion [rad or m, and per s].
         """
         if sensor is None and self.sensed:
             raise CalibError(f"rows '{self.name}' need torques of sensors behind the gears")
@@ -230,7 +232,7 @@ class TorqueRows:
         return np.einsum("nrk,nk->nr", projection(q, v), stacked)
 
     def repeated(self, n: int) -> np.ndarray:
-        """Return for each row (rows,) the index of a row with the same non-zero entries, else its own index."""
+        """Return for each row (rows,) the index of a row with the same non-zero entries, otherwise its own index."""
         rows = np.arange(self.count(n))
         if self.projection is not None:
             return rows
@@ -238,7 +240,7 @@ class TorqueRows:
 
 
 def projected(name: str, projection: Projection, of: TorqueRows | None = None) -> TorqueRows:
-    """Return torque rows that project other ones, by default those of the motors, onto fewer coordinates."""
+    """Return torque rows that project other rows (`of`; None: the motors') onto fewer coordinates."""
     return replace(of or MOTOR, name=name, projection=projection)
 
 

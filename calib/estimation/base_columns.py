@@ -20,11 +20,11 @@ class ColumnSplit:
 
     Attributes:
         kept: (b,) indices of the base columns, in W's order.
-        dropped: (p - b,) the others, those without any effect included.
+        dropped: (p - b,) indices of the other columns, including those without effect.
         without_effect: indices of the columns that are zero.
         coefficients: (b, p - b) with ``W[:, dropped] = W[:, kept] @ coefficients`` up to the tolerance.
-        singular_values: (p,) of W with its non-zero columns scaled to unit norm, falling.
-        tolerance: relative size below which the remainder of a scaled column counts as zero.
+        singular_values: (p,) singular values of W with its non-zero columns scaled to unit norm, descending.
+        tolerance: norm below which the independent part of a scaled column counts as zero.
     """
 
     kept: np.ndarray
@@ -50,16 +50,16 @@ class ColumnSplit:
 def split_columns(
     matrix: np.ndarray, groups: Sequence[np.ndarray] | None = None, tolerance: float = 1e-6
 ) -> ColumnSplit:
-    """Choose independent columns of W by pivoted QR, groups of columns in order of preference.
+    """Return a choice of independent columns of W by pivoted QR, groups of columns in order of preference.
 
-    Within a group the columns enter by pivoted QR (Gautier 1991), of two equivalent ones the earlier (so that rounding
+    Within a group the columns enter by pivoted QR (Gautier 1991), the earlier of two equivalent ones (so that rounding
     does not decide); a later group only adds columns independent of the earlier groups. Columns are scaled to unit norm
     first, except those of negligible norm, which have no effect (scaling a column of 1e-17 would turn rounding into
     information).
 
     Args:
-        matrix: (rows, p), whitened or in one unit; only its R factor is used.
-        groups: index arrays, most preferred first; columns in none of them come last. None: one group.
+        matrix: (rows, p) W, whitened or in one unit; only its R factor is used.
+        groups: arrays of column indices, most preferred first; columns in no group come last. None: one group.
         tolerance: see `ColumnSplit`.
     """
     p = matrix.shape[1]

@@ -26,7 +26,7 @@ MAX_MOVE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ConeOptimum:
-    """Optimum b (p,) of a cone program, with the multipliers of rows (c,), matrices (k, n, n) and equalities (e,)."""
+    """Optimum b (p,) of a cone program, with multipliers of its rows (c,), matrices (k, n, n) and equalities (e,)."""
 
     values: np.ndarray
     rows: np.ndarray
@@ -44,17 +44,19 @@ def minimise(
     equality_rows: np.ndarray | None = None,
     equality_values: np.ndarray | None = None,
 ) -> ConeOptimum:
-    """Minimise ½ ‖R b - z‖² under A b + c >= 0, E b = d and M_k(b) ⪰ λ 1; t = R b - z is an unknown: no squares.
+    """Minimise ½ ‖R b - z‖² under A b + c >= 0, E b = d and M_k(b) ⪰ λ 1; no squares are formed.
+
+    t = R b - z is added to the unknowns.
 
     Args:
-        upper, target: R (m, p), z (m,), of order one.
+        upper, target: R (m, p), z (m,), scaled to order one.
         rows, offset: A (c, p), c (c,).
-        matrices: (k, n, n, p), M_k = Σ_j A_kj b_j.
-        least: λ, one or (k,).
-        equality_rows, equality_values: E (e, p), d (e,); None for none.
+        matrices: (k, n, n, p) coefficients A_kj of M_k = Σ_j A_kj b_j.
+        least: λ, one number or (k,).
+        equality_rows, equality_values: E (e, p), d (e,); None without equalities.
 
     Raises:
-        NotConverged: where no point satisfies all.
+        NotConverged: where no point satisfies all constraints.
     """
     import clarabel
     from scipy import sparse
@@ -105,9 +107,9 @@ def minimise(
 
 
 def _solved(solver: "clarabel.DefaultSolver") -> "clarabel.DefaultSolution | None":
-    """Return Clarabel's solution; None where its step breaks down in LAPACK's eigenvalues, which it ends by a panic.
+    """Return Clarabel's solution; None where it panics, as an eigenvalue computation of LAPACK breaks down.
 
-    Whether an extreme step does depends on the processor's kernels of LAPACK.
+    Whether this happens at an extreme step depends on the processor's kernels of LAPACK.
     """
     try:
         return solver.solve()
@@ -119,13 +121,15 @@ def _solved(solver: "clarabel.DefaultSolver") -> "clarabel.DefaultSolution | Non
 
 
 def from_free(factor: np.ndarray, free: np.ndarray, normals: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Return the estimate under A b = d from the unconstrained one, b_f - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ (A b_f - d), Q = RᵀR.
+    """Return the estimate under A b = d from the unconstrained estimate b_f.
 
-    Gouriéroux & Monfort (1995, section 10.3): under inequalities the same, A and d those that bind.
+        b_f - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ (A b_f - d),    Q = RᵀR
+
+    (Gouriéroux & Monfort 1995, section 10.3); under inequalities with A and d of the binding ones.
 
     Args:
         factor: (p + 1, p + 1) triangle [R z; 0 ρ].
-        free: (p,) b_f.
+        free: (p,) unconstrained estimate b_f.
         normals: A (k, p), of full rank.
         sides: d (k,).
     """
@@ -141,11 +145,12 @@ def from_free(factor: np.ndarray, free: np.ndarray, normals: np.ndarray, sides: 
 def bounded(factor: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return argmin ‖R x - z‖² (p,) under A x >= 0, exact on the rows that Clarabel finds binding.
 
-    As Clarabel has it where that is degenerate: a multiplier would change its sign, or another row be violated.
+    Where this is degenerate (a multiplier would change its sign, or another row be violated), Clarabel's solution is
+    returned as it is.
 
     Args:
         factor: (p + 1, p + 1) triangle [R z; 0 ρ], R of full rank.
-        rows: A (c, p); one of a single entry is satisfied exactly.
+        rows: A (c, p); a row with a single non-zero entry is satisfied exactly.
     """
     p = len(factor) - 1
     norms = np.linalg.norm(factor[:p, :p], axis=0)

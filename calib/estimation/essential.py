@@ -30,13 +30,13 @@ class EliminationStep:
     """One step of the elimination: a dropped parameter.
 
     Attributes:
-        name: of the parameter.
-        rsd: its relative standard deviation before it went [%]; infinite for one at zero.
-        ratio: largest over smallest RSD of all parameters before it went.
-        f, p: statistic (x / σ)² of leaving it out, and the probability of a larger one if it is truly zero.
-        p_total: of leaving out all that went so far, against the base model.
-        residual_std: of the weighted residuals after it went.
-        listed: it went because it was on the drop list.
+        name: name of the dropped parameter.
+        rsd: its relative standard deviation before it was dropped [%]; infinite for a value of zero.
+        ratio: largest over smallest RSD of all parameters before it was dropped.
+        f, p: statistic F = (x / σ)² of dropping the parameter, and the probability of a larger F if it is truly zero.
+        p_total: the same probability for all parameters dropped so far, tested together against the base model.
+        residual_std: standard deviation of the weighted residuals after it was dropped.
+        listed: whether it was dropped because it was on the drop list.
     """
 
     name: str
@@ -54,7 +54,7 @@ class Elimination:
     """Result of the elimination from base to essential parameters.
 
     Attributes:
-        base, essential: the fit before and after, with the same weights for the rows.
+        base, essential: the fit before and after the elimination, with the same weights of rows.
         kept: (b_e,) indices of the essential columns.
         steps: dropped parameters, in order.
         refused: the rejected step that ended the elimination; None if all candidates were dropped.
@@ -78,13 +78,13 @@ def eliminate(
     std: np.ndarray | None = None,
     inflation: np.ndarray | None = None,
 ) -> Elimination:
-    """Return the elimination: drop the parameter with the largest RSD and re-estimate, until the rule stops it.
+    """Return the elimination: repeatedly drop the parameter with the largest RSD and re-estimate, until the rule stops.
 
-    RSD rule: stop when max RSD / min RSD < r_σ (Kolyubin et al. 2019; Jubien, Gautier & Janot 2014: r_σ in 10 … 30).
-    F rule: stop when leaving out the next one is refuted, by F = x² / σ² ~ F(1, r - b_e), or when all left out together
-    are, by F = [(RSS_ess - RSS_base) / (b - b_e)] / [RSS_base / (r - b)]; both computed as Wald statistics from the
-    covariance, which is the same number and respects `inflation`. Testing both is our choice: the total alone lets one
-    strong parameter hide among many that are zero.
+    RSD rule: stop when max RSD / min RSD < r_σ (Kolyubin et al. 2019; Jubien, Gautier & Janot 2014: r_σ in 10 … 30). F
+    rule: stop when dropping the next parameter is refuted, by F = x² / σ² ~ F(1, r - b_e), or dropping all of them
+    together, by F = [(RSS_ess - RSS_base) / (b - b_e)] / [RSS_base / (r - b)]; both are computed as Wald statistics
+    from the covariance, which gives the same number and respects `inflation`. Testing both is our choice: the total
+    alone lets one strong parameter hide among many that are zero.
 
     Args:
         data: triangles of the base columns.
@@ -93,8 +93,9 @@ def eliminate(
         level: probability of keeping a parameter that is zero, per step.
         keep: names of parameters that are never dropped.
         drop: names of parameters dropped first, whatever the rule.
-        std: (g,) of the groups; None: converged on the base model, then kept.
-        inflation: (g,) see `linear`; without it too many parameters are kept for autocorrelated residuals.
+        std: (g,) standard deviations of the groups; None: `settled_std` of the base model, then constant.
+        inflation: (g,) variance inflation, see `linear`; without it too many parameters are kept for autocorrelated
+            residuals.
     """
     _check_lists(data.names, keep, drop)
     if std is None:
@@ -125,7 +126,7 @@ def eliminate(
 def nested_test(base: LinearFit, dropped: Sequence[int]) -> tuple[float, float]:
     """Return F and its p-value for the hypothesis that the parameters with these indices are all zero.
 
-    Equal to the F-test of the two residual sums; F uses the residual variance of the base fit.
+    F equals that of the test of the two residual sums of squares; it uses the residual variance of the base fit.
     """
     values = base.estimate.values[list(dropped)]
     covariance = base.estimate.covariance[np.ix_(dropped, dropped)] * base.estimate.residual_std**2
@@ -139,7 +140,7 @@ def nested_test(base: LinearFit, dropped: Sequence[int]) -> tuple[float, float]:
 def _step(
     base: LinearFit, current: LinearFit, smaller: LinearFit, worst: int, dropped: list[int], listed: bool
 ) -> EliminationStep:
-    """Return the step from the current to a smaller model; `dropped`: all indices of the base model that went."""
+    """Return the step from the current to a smaller model; `dropped`: indices in the base model of all dropped ones."""
     rsd = current.estimate.rsd
     ratio = np.inf
     if rsd.min() > 0.0:

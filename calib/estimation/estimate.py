@@ -13,8 +13,8 @@ class Estimate(Frozen):
 
     Attributes:
         names, units: p strings each.
-        values: (p,) in their units.
-        covariance: (p, p).
+        values: (p,) values in these units.
+        covariance: (p, p) covariance of the values.
         residual_std: standard deviation of the whitened residuals (1 where the stated sigmas explain the residuals).
         dof: degrees of freedom, rows minus parameters.
     """
@@ -33,7 +33,7 @@ class Estimate(Frozen):
 
     @property
     def rsd(self) -> np.ndarray:
-        """Relative standard deviations (p,) 100 σ / |value| [%]; infinite at zero."""
+        """Relative standard deviations (p,), 100 σ / |value| [%]; infinite for a value of zero."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(self.values == 0.0, np.inf, 100.0 * self.sigma / np.abs(self.values))
 
@@ -51,7 +51,7 @@ class Estimate(Frozen):
 
 
 def whitened(values: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return [R z] (p, p + 1) of values and covariance (p, p), RᵀR = Σ⁻¹ and z = R x; zero variances count as one."""
+    """Return [R z] (p, p + 1) with RᵀR = Σ⁻¹ and z = R x, of values x and covariance Σ; zero variances count as 1."""
     sigma = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
     sigma = np.where(sigma > 0.0, sigma, 1.0)
     correlation = covariance / np.outer(sigma, sigma)

@@ -1,10 +1,10 @@
 """Least squares of y = W x + ρ from R factors of [W y]: ordinary, weighted per group, and with a prior.
 
 Covariances are those of the stated model of the noise. Filtered and decimated residuals are not white, and a covariance
-that counts every row as news is too small; `inflation` corrects it: group g counts as rows_g / inflation_g rows. It is
-the integrated autocorrelation 1 + 2 Σ ρ_k of the residuals (`whiteness.inflation`), or the sampling rate over twice the
-band that was kept. That is exact for columns which vary slowly against the residuals and cautious for the others. The
-values do not depend on it.
+that counts every row as independent is too small; `inflation` corrects the covariance: group g counts as rows_g /
+inflation_g rows. The inflation is the integrated autocorrelation 1 + 2 Σ ρ_k of the residuals (`whiteness.inflation`),
+or the sampling rate over twice the band that was kept. The correction is exact for columns that vary slowly against the
+residuals and cautious for other columns. The estimated values do not depend on it.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class LinearFit(Frozen):
         estimate: values, covariance, standard deviation of the weighted residuals, degrees of freedom.
         group_std: (g,) standard deviation of the residuals of each group, in units of y.
         condition: condition number of W as solved (rows weighted, columns in their units).
-        condition_normalised: the same with columns of unit norm.
+        condition_normalised: condition number of W with columns of unit norm.
     """
 
     estimate: Estimate
@@ -48,7 +48,7 @@ def ols(data: Triangles, inflation: np.ndarray | None = None) -> LinearFit:
 
     Args:
         data: triangles of W and y.
-        inflation: (g,) >= 1, see the module; None: every row counts.
+        inflation: (g,) >= 1, see the module; None: 1, every row is independent.
     """
     return _fit(data, np.ones(data.groups), inflation, stated=False)
 
@@ -60,8 +60,9 @@ def wls(data: Triangles, std: np.ndarray | None = None, inflation: np.ndarray | 
 
     Args:
         data: triangles of W and y, one group per standard deviation.
-        std: (g,) in units of y; `subsystem_std` is the study's choice. None: `settled_std`.
-        inflation: (g,) >= 1, see the module.
+        std: (g,) standard deviation of each group in units of y; `subsystem_std` is Kolyubin et al.'s choice. None:
+            `settled_std`.
+        inflation: (g,) >= 1, see the module; None: 1.
     """
     if std is None:
         std = settled_std(data)
@@ -71,12 +72,12 @@ def wls(data: Triangles, std: np.ndarray | None = None, inflation: np.ndarray | 
 def ridge(data: Triangles, mean: np.ndarray, covariance: np.ndarray, std: np.ndarray | None = None) -> LinearFit:
     """Estimate x from the data and a prior x ~ N(mean, covariance), by QR of [R; L⁻¹] with L Lᵀ = covariance.
 
-    The covariance of the result is that of the posterior. `condition` is that of the data with the prior.
+    The result has the covariance of the posterior, and the condition number of data and prior together.
 
     Args:
         data: triangles of W and y.
-        mean: (p,).
-        covariance: (p, p); an infinite diagonal entry means no prior knowledge.
+        mean: (p,) prior mean.
+        covariance: (p, p) prior covariance; an infinite diagonal entry means no prior knowledge.
         std: (g,) noise of each group in units of y; None: `settled_std` of the data, which must then determine x alone.
     """
     p = data.parameters
@@ -96,7 +97,10 @@ def ridge(data: Triangles, mean: np.ndarray, covariance: np.ndarray, std: np.nda
 
 
 def subsystem_std(data: Triangles) -> np.ndarray:
-    """Return σ_g of each group fitted alone, σ_g² = ‖ρ_g‖² / (r_g - rank W_g) (Kolyubin et al. 2019, after eq. 22)."""
+    """Return σ_g (g,) of each group fitted alone, σ_g² = ‖ρ_g‖² / (r_g - rank W_g).
+
+    Kolyubin et al. (2019), after eq. 22.
+    """
     p = data.parameters
     result = np.empty(data.groups)
     for g, factor in enumerate(data.factors):
@@ -112,10 +116,10 @@ def subsystem_std(data: Triangles) -> np.ndarray:
 
 
 def settled_std(data: Triangles, tolerance: float = 1e-6, limit: int = 200) -> np.ndarray:
-    """Return the converged σ_g of the groups: σ_g² = ‖y_g - W_g x‖² / (r_g - h_g), x the WLS estimate with them.
+    """Return the converged σ_g (g,): σ_g² = ‖y_g - W_g x‖² / (r_g - h_g), x being the WLS estimate with these σ.
 
     h_g = ‖W_g R⁻¹‖² / σ_g² is the group's share of the p parameters; the fixed point is the restricted maximum
-    likelihood (Patterson & Thompson 1971). Starts from `subsystem_std`.
+    likelihood (Patterson & Thompson 1971). The iteration starts from `subsystem_std`.
     """
     std = subsystem_std(data)
     change = np.inf
@@ -135,7 +139,7 @@ def settled_std(data: Triangles, tolerance: float = 1e-6, limit: int = 200) -> n
 
 
 def _fit(data: Triangles, std: np.ndarray, inflation: np.ndarray | None, stated: bool) -> LinearFit:
-    """Return the fit with rows divided by std; `stated`: std is the noise, otherwise the noise up to a factor."""
+    """Return fit with rows divided by std; `stated`: whether std is the noise itself or the noise up to a factor."""
     values, inverse, conditions = solve_triangle(combine(data, std), data.names)
     covariance = inverse @ inverse.T
     tau = np.ones(data.groups)
@@ -161,7 +165,7 @@ def _pack(
     inverse: np.ndarray,
     conditions: tuple[float, float],
 ) -> LinearFit:
-    """Return the fit with the residuals' standard deviations; degrees of freedom account for the inflation τ."""
+    """Return the fit with the residuals' standard deviations; its degrees of freedom account for the inflation τ."""
     squares = data.residual_squares(values)
     group_dof = data.rows - tau * leverage(data, std, inverse)
     dof = int(np.round(np.sum(group_dof / tau), 6))
@@ -192,7 +196,7 @@ def leverage(data: Triangles, std: np.ndarray, inverse: np.ndarray) -> np.ndarra
 
 
 def _floored(std: np.ndarray) -> np.ndarray:
-    """Return std with a floor relative to the largest, which keeps the weights of exact data finite."""
+    """Return std (g,) with a floor relative to the largest one, so that weights of exact data remain finite."""
     largest = std.max(initial=0.0)
     if largest > 0.0:
         return np.maximum(std, MIN_STD * largest)

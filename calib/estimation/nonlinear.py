@@ -35,7 +35,7 @@ Rows = tuple[np.ndarray, np.ndarray]
 
 
 class Status(Enum):
-    """Reason for the end of an iteration, with advice."""
+    """Reason why an iteration ended; each value is a message with advice."""
 
     CONVERGED = "converged"
     STALLED = "stalled: no damping gives a better step; the model is at its smallest residual or the Jacobian is wrong"
@@ -48,7 +48,7 @@ class Status(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Solution(Generic[State]):
-    """The last state of an iteration.
+    """Last state of an iteration, with its cost and convergence.
 
     Attributes:
         state: the estimate.
@@ -69,13 +69,13 @@ class Solution(Generic[State]):
 
 @dataclass(frozen=True, eq=False)
 class Reduced:
-    """The problem min ‖r - W x‖ as min ‖z - R x‖.
+    """A least-squares problem min ‖r - W x‖ reduced to min ‖z - R x‖.
 
     Attributes:
         factor: R (p, p), upper triangular.
         target: z (p,).
         cost: ‖r‖².
-        rows: of W.
+        rows: number of rows of W.
     """
 
     factor: np.ndarray
@@ -84,26 +84,26 @@ class Reduced:
     rows: int
 
     def extended(self, residual: np.ndarray, matrix: np.ndarray) -> Reduced:
-        """Return the problem with further rows r (m,) and W (m, p)."""
+        """Return the problem with further residuals r (m,) and rows W (m, p)."""
         stacked = triangle(np.concatenate([self.target, residual]), np.vstack([self.factor, matrix]))
         cost = self.cost + float(residual @ residual)
         return replace(stacked, cost=cost, rows=self.rows + len(residual))
 
     def moved(self, change: np.ndarray) -> Reduced:
-        """Return the problem with r + W dx in place of r."""
+        """Return the problem with r + W dx in place of r, given `change` dx (p,)."""
         target = self.target + self.factor @ change
         cost = self.cost + float(target @ target - self.target @ self.target)
         return replace(self, target=target, cost=cost)
 
     def gram(self) -> Gram:
-        """Return its sufficient statistics WᵀW, Wᵀr, rᵀr."""
+        """Return the problem's sufficient statistics WᵀW, Wᵀr, rᵀr."""
         return replace(gram(self.target, self.factor), total=self.cost, rows=self.rows)
 
 
 def triangle(residual: np.ndarray, matrix: np.ndarray) -> Reduced:
     """Return the problem of r (rows,) and W (rows, p) reduced by one QR of [W r].
 
-    `matrix` is best column-major: LAPACK then works in a single copy.
+    If `matrix` is column-major, LAPACK needs a single copy.
     """
     p = matrix.shape[1]
     stacked = np.empty((len(residual), p + 1), order="F")
@@ -114,14 +114,15 @@ def triangle(residual: np.ndarray, matrix: np.ndarray) -> Reduced:
 
 
 def reduced(pieces: Callable[[], Iterable[Rows]], total: Gram | None = None) -> Reduced:
-    """Return the problem of many pieces of rows reduced in the memory of one piece.
+    """Return the problem of many pieces of rows, reduced with the memory of one piece.
 
-    Up to `MOST_NUMBERS` by one QR. More by Cholesky of WᵀW with its columns scaled to unit norm, which takes a quarter
-    of the time and squares the condition number: beyond `MAX_CONDITION` by QR, piece upon piece, after all.
+    If W has up to `MOST_NUMBERS` entries, one QR is used. A larger one is reduced by Cholesky of WᵀW with columns
+    scaled to unit norm, which takes a quarter of the time but squares the condition number; if this exceeds
+    `MAX_CONDITION`, by QR, updated piece by piece.
 
     Args:
         pieces: yields the rows, the same at every call.
-        total: their statistics, of many rows where they are known already.
+        total: sufficient statistics of all rows, where they are known already; None: computed where needed.
     """
     if total is None:
         rows, total = _gathered(pieces())
@@ -138,7 +139,7 @@ def reduced(pieces: Callable[[], Iterable[Rows]], total: Gram | None = None) -> 
 
 
 def _gathered(pieces: Iterable[Rows]) -> tuple[list[Rows], Gram | None]:
-    """Return the pieces; where W has more than `MOST_NUMBERS` their statistics instead."""
+    """Return the pieces of rows and None; if W has more than `MOST_NUMBERS` entries, their statistics instead."""
     rows = list[Rows]()
     total = None
     for residual, matrix in pieces:
@@ -165,7 +166,7 @@ def _by_qr(pieces: Iterable[Rows]) -> Reduced:
 
 
 def _stacked(matrices: list[np.ndarray]) -> np.ndarray:
-    """Return matrices one above the other, column-major; a single one as it is."""
+    """Return matrices stacked vertically, column-major; a single matrix is returned as it is."""
     if len(matrices) == 1:
         return matrices[0]
     return np.concatenate([matrix.T for matrix in matrices], axis=1).T
@@ -201,16 +202,16 @@ def solve(
 
     Converged (our choice): the next Gauss–Newton step is shorter than ``tolerance`` standard deviations of the
     estimate, ‖Qᵀr‖ <= tolerance · ‖r‖ / sqrt(dof); or ‖r‖ has fallen to rounding, 1e-11 of where it started; or no step
-    is better any more, or the limit is reached, with residuals of `EXACT_RMS` standard deviations rms, as of computed
-    measurements: what they do not determine then lies in valleys too narrow to follow.
+    improves any more, or the limit is reached, while the residuals' rms is below `EXACT_RMS` standard deviations, as
+    with computed (noise-free) measurements: directions that these do not determine cannot be followed further.
 
     Args:
-        linearise: state -> the whitened problem, reduced.
-        retract: state, dx (p,) -> state.
+        linearise: function of a state that returns the whitened problem, reduced.
+        retract: function of a state and dx (p,) that returns the next state.
         start: the first state.
         damping: first λ; 0 for eq. 11.
         tolerance: length of the last step in standard deviations.
-        limit: linearisations at most.
+        limit: largest number of linearisations.
     """
     state = start
     problem = linearise(state)

@@ -1,4 +1,6 @@
-"""Ridge regression with one ridge per group of columns, each chosen by the data: automatic relevance determination."""
+"""Ridge regression with one ridge per group of columns, each estimated from the data (automatic relevance
+determination).
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,7 @@ MAX_PRIOR_WEIGHT = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Gram:
-    """Sufficient statistics of y = W x: WᵀW (p, p), Wᵀy (p,), yᵀy and the number of rows; they add up."""
+    """Sufficient statistics of y = W x: WᵀW (p, p), Wᵀy (p,), yᵀy and the number of rows; those of parts add up."""
 
     square: np.ndarray
     cross: np.ndarray
@@ -67,15 +69,15 @@ class Relevance:
 class Condensed:
     """Coordinates z (r,), r ≤ p, that replace the columns x (p,) without loss of information on any group.
 
-    Harmonics of a joint that turns by less than a whole turn are linear combinations of fewer of them, to within
-    rounding: their evidence costs r³, not p³.
+    Harmonics of a joint that moves by less than a turn are, to within rounding, linear combinations of fewer columns:
+    the evidence then costs r³ operations, not p³.
 
     Attributes:
         groups: (r,) group of each coordinate; -1 for no ridge.
-        sizes: (r,) first guess of its prior standard deviation, one per group.
-        counts: (r,) how many columns of x it stands for.
-        blocks: columns of x, and their matrix (columns, coordinates) in consecutive coordinates; None for unchanged
-            columns.
+        sizes: (r,) first guess of each coordinate's prior standard deviation, equal within a group.
+        counts: (r,) number of columns of x that each coordinate replaces.
+        blocks: pairs of indices of columns of x and their matrix (columns, coordinates); None for unchanged columns.
+            The coordinates of the blocks are consecutive.
     """
 
     groups: np.ndarray
@@ -84,7 +86,7 @@ class Condensed:
     blocks: tuple[tuple[np.ndarray, np.ndarray | None], ...]
 
     def columns(self, matrix: np.ndarray) -> np.ndarray:
-        """Return Wᵀ (r, ...) in these coordinates from Wᵀ (p, ...) in the original ones."""
+        """Return Wᵀ (r, ...) in the coordinates z from Wᵀ (p, ...) in the original ones."""
         flat = matrix.reshape(len(matrix), -1)
         parts = []
         for columns, basis in self.blocks:
@@ -95,7 +97,7 @@ class Condensed:
         return np.concatenate(parts).reshape(-1, *matrix.shape[1:])
 
     def gram(self, data: Gram) -> Gram:
-        """Return statistics in these coordinates."""
+        """Return the sufficient statistics in the coordinates z."""
         half = self.columns(data.square)
         parts = []
         for columns, basis in self.blocks:
@@ -107,12 +109,12 @@ class Condensed:
 
 
 def condensed(square: Callable[[np.ndarray], np.ndarray], groups: np.ndarray, start: np.ndarray) -> Condensed:
-    """Return coordinates of p columns with statistics WᵀW, with equal prior magnitude within a group.
+    """Return coordinates that replace p columns; within a group all have the same prior standard deviation.
 
     Args:
-        square: columns (k,) -> their WᵀW (k, k), of all rows that will ever be used.
+        square: function of indices of columns (k,) that returns their WᵀW (k, k), over all rows that will ever be used.
         groups: (p,) group of each column; -1 for no ridge.
-        start: (p,) first guess of each column's prior standard deviation; within a group their ratios stay.
+        start: (p,) first guess of each column's prior standard deviation; ratios within a group are kept.
     """
     numbers, number_of_column, members = np.unique(groups, return_inverse=True, return_counts=True)
     single = np.flatnonzero((groups < 0) | (members[number_of_column] == 1))
@@ -137,11 +139,11 @@ def condensed(square: Callable[[np.ndarray], np.ndarray], groups: np.ndarray, st
 
 @dataclass(frozen=True, eq=False)
 class _Elimination:
-    """Columns without a ridge, eliminated from the statistics: they follow from the values of the others.
+    """Columns without a ridge, eliminated from the statistics; their values follow from those of the other columns.
 
     Attributes:
-        columns: (f,) those eliminated.
-        root: (f, f) lower root of their WᵀW.
+        columns: (f,) indices of the eliminated columns.
+        root: (f, f) lower Cholesky factor of their WᵀW.
         half: (f, p) root⁻¹ times their rows of WᵀW.
         target: (f,) root⁻¹ times their Wᵀy.
     """
@@ -153,14 +155,14 @@ class _Elimination:
 
     @classmethod
     def of(cls, data: Gram, columns: np.ndarray) -> _Elimination:
-        """Eliminate columns (f,) of statistics."""
+        """Return the elimination of columns (f,) from sufficient statistics."""
         root = _root(data.square[np.ix_(columns, columns)])
         half = solve_triangular(root, data.square[columns], lower=True)
         target = solve_triangular(root, data.cross[columns], lower=True)
         return cls(columns, root, half, target)
 
     def values(self, other_values: np.ndarray) -> np.ndarray:
-        """Return the values (f,) of the columns from those of all others (p,), zero at these."""
+        """Return values (f,) of the eliminated columns from those of all others (p,), zero at the eliminated ones."""
         return solve_triangular(self.root, self.target - self.half @ other_values, trans=1, lower=True)
 
 
@@ -181,12 +183,12 @@ def relevance(
     Args:
         data: statistics of all rows.
         groups: (p,) group of each column; -1 for no ridge.
-        start: (p,) first guess of each column's prior standard deviation, one per group (`condensed` for others); read
-            where there is a ridge.
-        iterations: of the fixed point, at most.
+        start: (p,) first guess of each column's prior standard deviation, equal within a group (otherwise use
+            `condensed`); ignored for columns without a ridge.
+        iterations: largest number of fixed-point iterations.
         settled: the search ends when values change by less than this share of their standard deviations, rms
-            (`SETTLED`); 0: never early.
-        counts: (p,) how many columns each stands for (`Condensed`); None for one.
+            (`SETTLED`); 0: all iterations are made.
+        counts: (p,) number of original columns that each column replaces (`Condensed.counts`); None: one each.
     """
     if counts is None:
         counts = np.ones(len(groups))
@@ -252,7 +254,7 @@ def relevance(
 def _posterior(
     square: np.ndarray, cross: np.ndarray, penalty: np.ndarray, beta: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and variances of x from WᵀW and Wᵀy."""
+    """Return the posterior mean (p,) and variances (p,) of x from WᵀW, Wᵀy, the penalty and the noise precision β."""
     if not len(cross):
         return cross, cross
     # the variances need no more than the inverse of the root
@@ -262,10 +264,10 @@ def _posterior(
 
 
 def _root(square: np.ndarray, penalty: np.ndarray | float = 0.0) -> np.ndarray:
-    """Return the lower root of WᵀW with a penalty on its diagonal.
+    """Return the lower Cholesky factor of WᵀW with a penalty added to its diagonal.
 
-    A diagonal raised by 1e-12, or by as much more as it takes, keeps it regular to rounding: rows that repeat each
-    other leave columns that no two poses distinguish.
+    The diagonal is raised by 1e-12, or as much more as is needed to factorise: repeated rows leave columns that no two
+    poses distinguish.
     """
     for raised in 10.0 ** np.arange(-12.0, 1.0, 2.0):
         system = square.copy()

@@ -1,6 +1,6 @@
-"""Weights of robust losses, of the residuals of single rows.
+"""Weights of robust losses for the residuals of single rows, and variances as weighted sums of known shapes.
 
-`variance_weights` estimates variances as a sum of known shapes with unknown weights, none negative.
+`variance_weights` estimates variances as a sum of known shapes with unknown non-negative weights.
 """
 
 import numpy as np
@@ -26,8 +26,8 @@ def variance_weights(
         squares: (m,) squared errors.
         shapes: (m, k) columns whose non-negative combination is the variance; not negative.
         start: (k,) not negative; zeros stay zero.
-        counts: (m,) how many errors each is worth.
-        rounds: of the fixed point; fewer will do from weights of nearly the same errors.
+        counts: (m,) number of errors that each squared error represents.
+        rounds: number of fixed-point updates; fewer suffice if `start` is from nearly the same errors.
     """
     weights = np.array(start, dtype=float)
     columns = np.ascontiguousarray(shapes.T)
@@ -46,9 +46,9 @@ def weights(size: np.ndarray, loss: str, scale: float | None = None) -> np.ndarr
     normal residuals; Holland & Welsch 1977).
 
     Args:
-        size: any shape, >= 0.
+        size: residuals' absolute values over sigma, of any shape.
         loss: one of `LOSSES`.
-        scale: k or c in place of the defaults.
+        scale: k or c; None: the values above.
     """
     if loss == "none":
         return np.ones_like(size)
@@ -62,7 +62,7 @@ def weights(size: np.ndarray, loss: str, scale: float | None = None) -> np.ndarr
 
 
 def spread(residuals: np.ndarray) -> float:
-    """Return the robust standard deviation 1.4826 · median |r| of residuals centred at zero; 0 without residuals."""
+    """Return the robust standard deviation 1.4826 · median |r| of residuals r centred at zero; 0 if there are none."""
     if not residuals.size:
         return 0.0
     return float(1.4826 * np.median(np.abs(residuals)))

@@ -1,9 +1,9 @@
-"""All information of y = W x in triangles, the R factors of [W y] of each group of rows, updated block by block.
+"""R factors ("triangles") of [W y], one per group of rows, which hold all information of y = W x.
 
-An hour at 1 kHz of seven joints with 100 parameters is a matrix of 20 GB and a triangle of 80 kB. One triangle is kept
-per group (a joint, a load case, a file), so that weights may change afterwards without another pass over the data: the
-weighted problem is the QR of the stacked R_g / σ_g. Nothing is squared on the way: what QR of the whole matrix can
-resolve, the triangles resolve too.
+An hour at 1 kHz of seven joints with 100 parameters is a matrix of 20 GB and a triangle of 80 kB. They are updated
+block by block. One triangle is kept per group (a joint, a load case, a file), so that weights may change afterwards
+without another pass over the data: the weighted problem is the QR of the stacked R_g / σ_g. WᵀW is never formed, so
+that the triangles are as accurate as a QR of the whole matrix.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ class Triangles:
     """R factors of [W y], one per group of rows.
 
     Attributes:
-        names, units: p strings each, of the columns of W.
+        names, units: names and units of the p columns of W.
         factors: (g, p + 1, p + 1) upper triangular; its last column belongs to y.
-        rows: (g,) rows absorbed so far.
+        rows: (g,) number of rows absorbed so far in each group.
     """
 
     names: tuple[str, ...]
@@ -54,17 +54,17 @@ class Triangles:
         return len(self.names)
 
     def residual_squares(self, values: np.ndarray) -> np.ndarray:
-        """Return ‖y_g - W_g x‖² of every group (g,), from the R factors alone."""
+        """Return ‖y_g - W_g x‖² of every group (g,) for values x (p,), from the R factors alone."""
         return np.sum((self.factors @ np.append(values, -1.0)) ** 2, axis=1)
 
     def relative_errors(self, values: np.ndarray) -> np.ndarray:
-        """Return 100 ‖y_g - W_g x‖ / ‖y_g‖ [%] of every group (g,); 0 where y_g is."""
+        """Return 100 ‖y_g - W_g x‖ / ‖y_g‖ [%] of every group (g,) for values x (p,); 0 where y_g is zero."""
         size = self.residual_squares(np.zeros(self.parameters))
         ratio = self.residual_squares(values) / np.where(size > 0.0, size, np.inf)
         return 100.0 * np.sqrt(ratio)
 
     def select(self, columns: np.ndarray) -> Triangles:
-        """Return the R factors of the model with only these columns, in the given order."""
+        """Return the R factors of the model with only these columns (indices), in the given order."""
         columns = np.asarray(columns, dtype=int)
         with_target = np.append(columns, self.parameters)
         factors = np.stack([retriangulate(factor[:, with_target]) for factor in self.factors])
@@ -74,7 +74,7 @@ class Triangles:
 
 
 def empty(names: Sequence[str], units: Sequence[str] | None = None, groups: int = 1) -> Triangles:
-    """Return empty R factors, of a problem without rows."""
+    """Return the R factors of a problem without rows; units None: none known."""
     p = len(names)
     if units is None:
         units = [""] * p
@@ -124,7 +124,7 @@ def collect(
     names: Sequence[str] | None = None,
     units: Sequence[str] | None = None,
 ) -> Triangles:
-    """Return the R factors of a whole problem; without names the columns are called x1, x2, …"""
+    """Return the R factors of a whole problem; names None: the columns are called x1, x2, …"""
     matrix = shaped(matrix, (None, None), "observation matrix W")
     if names is None:
         names = [f"x{k + 1}" for k in range(matrix.shape[1])]
@@ -135,7 +135,7 @@ def collect(
 
 
 def combine(data: Triangles, std: np.ndarray | None = None) -> np.ndarray:
-    """Return the R factor (p + 1, p + 1) of all rows, those of group g divided by std[g] (None: by one)."""
+    """Return the R factor (p + 1, p + 1) of all rows together, rows of group g divided by std[g]; None: undivided."""
     scale = np.ones(data.groups)
     if std is not None:
         scale = shaped(std, (data.groups,), "standard deviation per group")
@@ -158,9 +158,9 @@ def retriangulate(stacked: np.ndarray, overwrite: bool = False) -> np.ndarray:
 
 
 def continued(upper: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return the R factor (k, k) of [upper; rows], of a triangle (k, k) and more rows (N, k), which are overwritten.
+    """Return the R factor (k, k) of a triangle `upper` (k, k) with more rows (N, k) below; both may be overwritten.
 
-    Householder's way as in `retriangulate`, in half the time, since the panels are narrow.
+    By Householder reflections as in `retriangulate`, in half the time, since the panels are narrow.
     """
     panel = min(PANEL, len(upper))
     triangle = np.array(upper, order="F")
@@ -173,9 +173,9 @@ def _upper(size: int) -> np.ndarray:
 
 
 def condition_numbers(factor: np.ndarray) -> tuple[float, float]:
-    """Return cond(W) and cond(W with unit-norm columns) from W or any R factor of it; zero columns are left out.
+    """Return cond(W) and cond(W with unit-norm columns) from W or any R factor of it; zero columns are ignored.
 
-    Such columns belong to parameters without rows, e.g. of a joint that stands; infinite where all columns are.
+    Zero columns belong to parameters without rows, e.g. of a joint at rest. Both are infinite if all columns are zero.
     """
     norms = np.linalg.norm(factor, axis=0)
     excited = norms > 0.0
@@ -205,7 +205,7 @@ def solve_triangle(factor: np.ndarray, names: Sequence[str]) -> tuple[np.ndarray
 
 
 def require_rank(scaled: np.ndarray, names: Sequence[str], advice: str = ADVICE) -> np.ndarray:
-    """Return the singular values of a matrix with columns of comparable size; refuse dependent columns by name.
+    """Return the singular values of a matrix whose columns have comparable norms; columns must be independent.
 
     Raises:
         Unidentifiable: naming every column with a part in a null direction.
@@ -224,7 +224,7 @@ def require_rank(scaled: np.ndarray, names: Sequence[str], advice: str = ADVICE)
 
 
 def _update(factor: np.ndarray, matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Return the R of [factor; matrix target], factorising non-zero columns only."""
+    """Return the R factor of [factor; matrix target]; only non-zero columns are factorised."""
     top = factor[factor.any(axis=1)]
     in_matrix = np.append(matrix.any(axis=0), True)
     live = np.flatnonzero(in_matrix | top.any(axis=0))

@@ -1,4 +1,4 @@
-"""Tests of residuals: correlation in time, departure from the normal law, share explained."""
+"""Tests of residuals: autocorrelation, departure from the normal distribution, and share explained (R²)."""
 
 from dataclasses import dataclass
 
@@ -14,12 +14,12 @@ class Whiteness:
     """Results of the whiteness tests of one series of residuals.
 
     Attributes:
-        acf, pacf: (lags,) at lags 1, 2, …
-        bound: half width 1.96 / sqrt(N) in which 95 % of a white series' values lie.
+        acf, pacf: (lags,) autocorrelation and partial autocorrelation at lags 1, 2, …
+        bound: 1.96 / sqrt(N); 95 % of a white series' autocorrelations are within ± this bound.
         outside: share of the autocorrelations beyond the bound; 0.05 for a white series.
-        ljung_box_p: probability of a larger statistic of Ljung and Box in a white series.
-        kurtosis: excess, 0 for normal residuals.
-        normal_p: probability under the normal law, D'Agostino & Pearson (1973); it assumes independent residuals.
+        ljung_box_p: probability that a white series has a larger Ljung–Box statistic.
+        kurtosis: excess kurtosis, 0 for normal residuals.
+        normal_p: p-value of the hypothesis of normal residuals, D'Agostino & Pearson (1973); assumes them independent.
     """
 
     acf: Array
@@ -74,7 +74,7 @@ def _normality(skewness: float, kurtosis: float, n: int) -> float:
     """Return the probability of at least this skewness and excess kurtosis in n >= 20 normal values.
 
     Both are turned into normal variables, whose squares add up (D'Agostino & Pearson 1973; D'Agostino 1970;
-    Anscombe & Glynn 1983). As `scipy.stats.normaltest`, which takes half a second to load.
+    Anscombe & Glynn 1983). Equal to `scipy.stats.normaltest`, which takes half a second to load.
     """
     # skewness (D'Agostino 1970)
     y = skewness * np.sqrt((n + 1) * (n + 3) / (6.0 * (n - 2)))
@@ -95,7 +95,10 @@ def _normality(skewness: float, kurtosis: float, n: int) -> float:
 
 
 def autocorrelation(residual: np.ndarray, lags: int) -> np.ndarray:
-    """Return ρ_k = Σ_t x_t x_{t+k} / Σ_t x_t² for k = 1 … lags, means removed (by FFT); sums run over columns, too."""
+    """Return ρ_k = Σ_t x_t x_{t+k} / Σ_t x_t² for k = 1 … lags (by FFT), means removed.
+
+    For a residual (N, columns) both sums run over the columns, too.
+    """
     columns = np.asarray(residual, dtype=float).reshape(len(residual), -1).T
     size = 1 << (2 * len(residual) - 1).bit_length()
     spectrum = np.zeros(size // 2 + 1)
@@ -124,7 +127,8 @@ def partial_autocorrelation(acf: np.ndarray) -> np.ndarray:
 def ljung_box(acf: np.ndarray, count: int) -> tuple[float, float]:
     """Return Q = N (N + 2) Σ ρ_k² / (N - k) and P(χ²(lags) > Q) (Ljung & Box 1978).
 
-    Residuals of a regression on given columns lose no degree of freedom here; those of an ARMA model would.
+    No degrees of freedom are subtracted, as is right for residuals of a regression on given columns, not of an ARMA
+    model.
     """
     lags = np.arange(1, len(acf) + 1)
     statistic = count * (count + 2.0) * np.sum(acf**2 / (count - lags))
@@ -132,12 +136,13 @@ def ljung_box(acf: np.ndarray, count: int) -> tuple[float, float]:
 
 
 def inflation(residual: np.ndarray) -> float:
-    """Return the integrated autocorrelation τ = 1 + 2 Σ_{k<=m} ρ_k >= 1: N residuals count as N / τ white ones.
+    """Return the integrated autocorrelation τ = 1 + 2 Σ_{k<=m} ρ_k >= 1: N residuals count as N / τ independent ones.
 
-    The window is the smallest m >= 5 τ(m) (Sokal 1997): longer sums add noise only. At most N / 4.
+    The window is the smallest m >= 5 τ(m) (Sokal 1997): longer sums only add noise. It is at most N / 4.
 
     Args:
-        residual: (N,), or (N, 1 + p) with the columns W C^(1/2) of a fit behind it: what it took out of the errors.
+        residual: (N,) residuals, or (N, 1 + p) with the columns W C^(1/2) of the fit appended, which account for the
+            part of the errors that the fit absorbed.
     """
     x = np.asarray(residual, dtype=float)
     if len(x) < 8:

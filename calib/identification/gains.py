@@ -1,7 +1,8 @@
 """Drive gains from currents: torque = gain · current, identified from runs without and with a payload of known mass.
 
-A model fitted to currents is known up to a scale per joint; what joints share (a link's mass is felt by all before it)
-ties the scales together, and a payload of known mass fixes them (Gautier & Briot 2011, 2014):
+A model fitted to currents is known up to a scale per joint; parameters that act on several joints (a link's mass acts
+on all joints before it) relate the scales to each other, and a payload of known mass fixes them (Gautier & Briot 2011,
+2014):
 
     K_j i_j = W_j χ  (unloaded),    K_j i_j = W_j χ + P_j χ_L  (loaded),    one entry of χ_L known.
 
@@ -57,11 +58,11 @@ class DriveGains:
 
     Attributes:
         gains: (n,) torque per current [N m/A or N/A].
-        covariance: (n, n).
+        covariance: (n, n) covariance of the gains.
         names, values: all parameters in torque units: base parameters and the payload's.
-        std: (n,) of the residual currents [A].
+        std: (n,) standard deviation of the residual currents [A].
         scale: text on what determines the scale.
-        own: joints, from 0, whose gain the motion does not identify: set to one, torque in amperes.
+        own: joints, from 0, whose gain the motion does not identify: set to one, so that its torque is in amperes.
     """
 
     gains: np.ndarray
@@ -96,10 +97,10 @@ class GainRecord:
     """Record of drive gains in files, by joint: torque = gain · current.
 
     Attributes:
-        values: (n,); NaN where the motion does not identify the gain: that joint's torque is in amperes.
-        sigma: (n,); NaN for the reference joint and where the gain is not identified.
+        values: (n,) gains; NaN where the motion does not identify the gain: that joint's torque is in amperes.
+        sigma: (n,) standard deviations; NaN for the reference joint and where the gain is not identified.
         told: see `DriveGains.told`.
-        covariance: (n, n).
+        covariance: (n, n) covariance of the gains.
         unit, scale: unit of the gains, and what determines their scale.
     """
 
@@ -139,14 +140,14 @@ def identify_gains(
     Args:
         currents: columns of the model with the payload, target the currents.
         payload: parameters whose values are known (a payload's mass, its centre of mass), in SI.
-        inflation: (n,) how many rows count as one.
+        inflation: (n,) number of rows that count as one; None: 1.
         start: (n,) first guess of the gains; None: from least squares on the torques of the known parameters.
         reference: where nothing is known, the joint whose gain is set to 1: the others follow relative to it, and
             torques come out in amperes of that joint.
-        own: joints whose gain stays at one, their torque in amperes of their own.
+        own: joints whose gain is fixed at one, so that their torque is in amperes.
 
     Raises:
-        Unidentifiable: where no joint feels a known parameter, directly or through others.
+        Unidentifiable: where a known parameter acts on no joint, neither directly nor through others.
     """
     n, names = currents.groups, currents.names
     fixed = np.array([names.index(name) for name in payload], dtype=int)
@@ -224,16 +225,16 @@ def identify_gains(
 def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray, reference: int) -> DriveGains:
     """Return the gains relative to that of a reference joint; gains that the motion does not identify are set to one.
 
-    Sigmas are the larger of the residuals' and of a jackknife over blocks of time (Efron & Tibshirani 1993, eq. 11.5),
-    which sees part of what the model leaves, times `LEFT`. A gain is identified where its sigma is below `MAX_SIGMA` of
-    it and it is within a factor `MAX_FACTOR` of the others: what links share with one motor at the wrist is little
-    beside friction, and a fit then takes what the model leaves for inertia (our choice). Where the search does not
-    settle, the gain that ran away furthest is not identified.
+    Sigmas are the larger of those from residuals and those of a jackknife over time blocks (Efron & Tibshirani 1993,
+    eq. 11.5), which contain part of the model's errors, times `LEFT`. A gain counts as identified if its sigma is below
+    `MAX_SIGMA` times the gain, and the gain is within a factor `MAX_FACTOR` of the others: at a wrist, torques shared
+    with other joints are small compared with friction, and a fit then mistakes model errors for inertia (our choice).
+    Where the search does not converge, the gain that diverged most is not identified.
 
     Args:
         data: triangles of [W i] by block and joint, group = block · joints + joint.
         joints: number of joints.
-        inflation: (joints,) how many rows count as one.
+        inflation: (joints,) number of rows that count as one.
         reference: the joint whose gain is one.
     """
     rows_of_block = np.asarray(data.rows).reshape(-1, joints).sum(axis=1)
@@ -296,7 +297,7 @@ def _most_distant(error: NotConverged, reference: int, unidentified: Sequence[in
     """Return the joint whose gain diverged most (gains not converged): the motion does not identify this gain.
 
     Raises:
-        NotConverged: the error, where no joint remains.
+        NotConverged: `error` itself, where no joint remains.
     """
     gains = np.array(error.last, dtype=float)
     log_gains = np.nan_to_num(np.log(gains), nan=np.inf)

@@ -63,9 +63,9 @@ class Identification(Generic[Model]):
         elimination: the steps to the essential parameters; None if not requested.
         friction: richer friction selected on held-out time.
         settings: settings of the identification.
-        rows: the training data.
+        rows: observation rows of the training data.
         terms: the drive term of each estimated parameter; None for parameters of bodies.
-        condition: of the base parameters' observation matrix, as it is and with columns of unit norm.
+        condition: condition numbers of the base parameters' observation matrix, as it is and with columns of unit norm.
         prior: prior of the base parameters; None if unused.
         ripples: gear ripple above the identification band, by joint; not part of the estimate's covariance.
         loop: results of simulating the recordings' closed loop, where one is stated.
@@ -100,11 +100,11 @@ def identify(
     """Return the dynamics of a robot identified from recordings, on its calibrated geometry.
 
     Args:
-        robot: as a geometric fit returns it, or a chain that no fit has moved. Base columns are chosen on its nominal
+        robot: the chain that a geometric fit returns, or a nominal chain. Base columns are chosen on its nominal
             geometry; joint corrections take part where the cases have the links' motion.
         cases: training recordings.
-        settings: the choices; None: those that suit a serial arm with motor torques.
-        progress: called with a few words at each stage.
+        settings: settings of the identification; None: those that suit a serial arm with motor torques.
+        progress: called with a short text at each stage; None: not called.
     """
     settings = settings or IdentificationSettings()
     robot = as_calibrated(robot)
@@ -144,18 +144,18 @@ def identify_model(
     """Return the identification of a model, linear in its parameters, from recordings.
 
     Base columns, prior, richer friction, the method's estimate, ripple, essential parameters: a sequence of steps
-    around one method, each of which says what it accepts.
+    around one method, which states which of them it accepts.
 
     Args:
-        model: of a serial chain, or of anything else that meets the protocol.
-        cases: training recordings, their targets those of the model's torque rows.
-        settings: the choices; what makes a chain's model of them (drives, payloads, gravity) is in `model` already.
-        nominal: the same model on the geometry that base columns are chosen on; None: `model`.
-        states: to choose base columns over; None: the model's own.
-        cad: the first of the model's parameters by the robot's description; None where it holds no masses.
-        shape: the same of a robot of one kilogram, where it holds none; None: not known either.
+        model: model of a serial chain, or any other `RegressorModel`.
+        cases: training recordings, with the torques of the model's rows as targets.
+        settings: settings of the identification; drives, payloads and gravity are taken from `model`.
+        nominal: the same model on the geometry on which base columns are chosen; None: `model`.
+        states: states at which base columns are compared; None: the model's random states.
+        cad: the bodies' parameters from the robot's description; None where it has no masses.
+        shape: the bodies' parameters of a robot of one kilogram, where there are no CAD values; None: not known.
         effort: (n,) torque limits of the joints, up to a factor; None: not known.
-        progress: called with a few words at each stage.
+        progress: called with a short text at each stage; None: not called.
 
     Raises:
         CalibError: the method's failure, where there is no estimate.
@@ -266,14 +266,14 @@ def _weighed_after_standstills(
     prior: Prior,
     column_groups: np.ndarray,
 ) -> list[ObservationRows]:
-    """Return the rows weighed where friction at rest still fades after a standstill, as the residuals ask for.
+    """Return the rows with lower weights after standstills, where friction at rest still decays.
 
-    Richer friction explains slow motion, too: its residuals count.
+    The decay is estimated from residuals with richer friction, which explains slow motion, too.
 
     Args:
-        rows: of all recordings, richer friction included.
-        first: the fit that weighs the joints' rows.
-        prior: of the base parameters.
+        rows: rows of all recordings, richer friction included.
+        first: the fit from which the joints' weights come.
+        prior: prior of the base parameters.
         column_groups: ridge group of each column; -1 for base parameters.
     """
     inflation = prior.tempering * first.inflation
@@ -481,8 +481,8 @@ def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) ->
     """Return the filter of all rows: the widest of the cases' bands; if that gives too many rows, with every second,
     third, ... row.
 
-    Too many are more than ``settings.samples``. The band stays: long recordings have rows to spare, but what they show
-    of fast motion no other row identifies.
+    Too many are more than ``settings.samples``. The band is not reduced: long recordings have redundant rows, but fast
+    motion is only identified in a wide band.
     """
     rates = [case.motion.rate for case in cases]
     message = f"recordings of {min(rates):.4g} Hz and {max(rates):.4g} Hz cannot be combined; resample one of them"

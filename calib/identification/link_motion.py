@@ -1,18 +1,19 @@
 """Motion of the links behind joints with corrections, and what the corrections' uncertainty means for the dynamics.
 
-A geometric fit with joint corrections (`calib.robot.calibrated`) says how far the link of joint j is from its reading,
+A geometric fit with joint corrections (`calib.robot.calibrated`) gives the position of the link of joint j relative to
+the joint's reading,
 
     q_link,j = q_j + δ_j(q, τ),    δ_j = Σ_terms c · b(q, τ),
 
-of compliance under the torque τ_j, gear ratio, coupled axes, harmonics and sag. Compliance was fitted at rest, where τ
-is the gravity torque; in motion it is the torque of the bodies, gravity, Coriolis and inertia alike (a joint of
-stiffness 1/c, Spong 1987, whose motor and link are both of one position signal), computed at the measured motion from
-the masses that the fit's gravity torques were made of, and low-passed to the identification band. δ is added to the
-filtered positions; its first and second differences in time are added to v and a. First order in c: the torque that
+with terms of compliance under the torque τ_j, gear ratio, coupled axes, harmonics and sag. Compliance was fitted at
+rest, where τ is the gravity torque; in motion it is the torque of the bodies, gravity, Coriolis and inertia alike (a
+joint of stiffness 1/c, Spong 1987, whose motor and link are both of one position signal), computed at the measured
+motion from the masses that the fit used for gravity torques, and low-passed to the identification band. δ is added to
+the filtered positions; its first and second differences in time are added to v and a. First order in c: the torque that
 bends the joint is that of the unbent arm.
 
-Terms that move other elements than joints (tilting axes, wobble) are left out of the dynamics, and so is everything
-where an identification simulates the robot, which is rigid there, and for rows of power.
+Terms that move other elements than joints (tilting axes, wobble) are left out of the dynamics, and so are all terms
+where an identification simulates the robot (as rigid), and for rows of power.
 """
 
 from dataclasses import replace

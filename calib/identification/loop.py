@@ -234,8 +234,8 @@ class ExogeneityTest:
 
     Attributes:
         statistic: F of the augmented regression.
-        degrees: of freedom, numerator and denominator.
-        p: probability of a larger statistic if the claim is true.
+        degrees: degrees of freedom, numerator and denominator.
+        p: probability of a larger statistic if the hypothesis is true.
     """
 
     statistic: Number
@@ -257,16 +257,17 @@ class LoopMetrics:
     """Results of testing an estimate with instrumental variables from a simulated control loop.
 
     Attributes:
-        failure: why there are no instruments.
-        notes: of the loops.
+        failure: reason why there are no instruments; empty otherwise.
+        notes: remarks on the simulated loops.
         instruments: the method that simulates; `beside`: whether the estimate is another method's.
-        rounds: simulations until it settled.
+        rounds: number of iterations until convergence.
         durbin_wu_hausman: whether least squares is biased.
-        largest_shift_sigma: of a parameter from least squares.
-        cragg_donald, instruments_weak, least_partial_r2: how strong the instruments are.
+        largest_shift_sigma: largest difference of a parameter from least squares, in standard deviations.
+        cragg_donald, instruments_weak, least_partial_r2: strength of the instruments, see `InstrumentStrength`.
         distance_percent, simulated_torque_error_percent, strays_times: (n,) see `Instrumental`.
         valid, explains: whether the instruments may be trusted, and explain as much as the model.
-        controller: that was simulated; of its torque, `controller_explains_percent` (n,) where it was identified.
+        controller: the simulated controller; if it was identified, `controller_explains_percent` (n,) is the share of
+            its torque that it explains.
     """
 
     failure: str = ""
@@ -316,7 +317,7 @@ class LoopResults:
         metrics: as ``metrics.json`` stores them; None without a loop.
         findings: on the loop, the instruments, and the bias of least squares.
         table: rows of ``instrumental.csv``.
-        controller: that was simulated.
+        controller: the simulated controller.
         disagreement: how recorded torques contradict an estimate that relies on the stated loop; None if they do not.
     """
 

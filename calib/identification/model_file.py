@@ -227,7 +227,7 @@ def _term(entry: ParsedTable) -> DriveTerm:
 def identified_masses(folder: str | Path, chain: Chain) -> np.ndarray:
     """Return the standard parameters (n, 10) of an arm's bodies from an identification's folder.
 
-    Their gravity torques are right on the geometry that they were identified on, single parameters are not
+    Their gravity torques are correct on the geometry of the identification; single parameters need not be
     (`calib.dynamics.base.to_standard`); payloads are left out.
 
     Raises:

@@ -48,8 +48,8 @@ class PredictionErrors:
     """Prediction errors on one set of samples.
 
     Attributes:
-        relative_error_percent: of all rows together, and of each.
-        rms: (rows,) of τ - τ̂ in the torque's unit.
+        relative_error_percent: relative errors of all rows together, and of each row.
+        rms: (rows,) rms of τ - τ̂ in the torque's unit.
         samples: number of torque values in all rows.
     """
 
@@ -120,17 +120,17 @@ class Score:
 
     @property
     def stands(self) -> bool:
-        """Whether joints stand for a noticeable part of the recording, more than in reversals."""
+        """Whether joints are at rest for a noticeable part of the recording, not only in reversals."""
         return self.motion_share < 1.0 - REST_SHARE and self.moving.samples > 0
 
     @property
     def judged(self) -> PredictionErrors:
-        """Errors that a verdict is about: in motion, as friction at rest takes any value; of all where none stands."""
+        """Errors that the verdict uses: in motion, as friction at rest is undetermined; all, if no joint is at rest."""
         return self.moving if self.stands else self.raw
 
     @property
     def at_rest(self) -> str:
-        """Error of standing joints as text; empty where none stands."""
+        """Error of joints at rest as text; empty if no joint is at rest."""
         return f"{self.standing.total:.2f} %" if self.stands else ""
 
 
@@ -169,8 +169,8 @@ def score(
     Args:
         case: the recording.
         predicted: (N, rows) torques.
-        slow: what stands, see `calib.data.signals.motion.moving`.
-        apart: rows in a unit of their own, which no total holds.
+        slow: speed below which a joint counts as at rest, see `calib.data.signals.motion.moving`.
+        apart: rows in a different unit, excluded from totals.
     """
     motion = case.motion
     moves = moving(motion) if slow is None else moving(motion, slow)

@@ -110,10 +110,10 @@ class Prior:
     """A normal prior of b base parameters with mean zero.
 
     Attributes:
-        covariance: (b, b).
+        covariance: (b, b) prior covariance.
         deviation: (b,) standard deviations about the common part of the whole robot, s u.
         sizes: kind → σ, and ``whole`` → κ.
-        source: of u, ``cad`` or ``sizes``.
+        source: source of u, ``cad`` or ``sizes``.
         first: the fit of the base parameters with this prior, without richer friction.
         tempering: weight of the prior for the values, relative to its weight for their covariance.
     """
@@ -138,9 +138,10 @@ class Prior:
         return np.insert(self.rows, [len(self.deviation)] * count, 0.0, axis=1)
 
     def resting(self, covariance: np.ndarray) -> np.ndarray:
-        """Return the parameters (b,) that rest on the prior: data reduce their variance by less than `RESTING_SHARE`.
+        """Return the mask (b,) of parameters determined by the prior: data reduce their variance by less than
+        `RESTING_SHARE`.
 
-        Counted about the whole robot's share: its factor s is one number, and soon identified.
+        The variances are those about s u, since the common factor s is identified by little data.
         """
         variance = np.diag(covariance)[: len(self.deviation)]
         return variance > (1.0 - RESTING_SHARE) * self.deviation**2
@@ -184,15 +185,15 @@ def find_prior(
     """Return the prior of the base parameters with sizes that maximise the evidence.
 
     Args:
-        model: whose parameters they are.
+        model: model of the base parameters.
         base: the base columns of the model.
-        rows: in the base columns, and those of richer friction behind them.
-        robot: u, the first of the model's parameters, up to a factor; None: nothing is known of the whole robot.
+        rows: rows in the base columns, followed by those of richer friction.
+        robot: u, the bodies' parameters up to a factor; None: not known.
         source: of `robot`: ``cad`` or ``sizes``.
-        noise: (rows,) of the torques up to a common factor; None: from the residuals.
-        groups: (k,) of the columns of richer friction, each of a size of its own, which serves here alone.
-        start: the prior without that friction, or of another tempering, to start from.
-        effort: (n,) torque limits of the joints, up to a factor; None: joints alike.
+        noise: (rows,) standard deviation of the torques up to a common factor; None: from the residuals.
+        groups: (k,) group of each column of richer friction; each group has a separate size, used only here.
+        start: initial prior, without richer friction or with another tempering; None: none.
+        effort: (n,) torque limits of the joints, up to a factor; None: equal joints.
         tempering: see `Prior`.
     """
     parts = divided(rows)
@@ -290,11 +291,11 @@ def weighing(
     """Return standard deviation and inflation of the residuals (rows,), by their degrees of freedom.
 
     Args:
-        rows: of all recordings.
+        rows: rows of all recordings.
         data: triangles of the rows, one group per torque row.
         values, covariance: (p,), (p, p) the estimate.
-        std, inflation: (rows,) that it was weighed with.
-        noise: (rows,) of the torques up to a common factor; None: from the residuals.
+        std, inflation: (rows,) values with which the estimate was weighted.
+        noise: (rows,) standard deviation of the torques up to a common factor; None: from the residuals.
     """
     columns = data.factors[:, :, :-1]
     parameters_of_row = np.einsum("gik,gik->g", columns @ covariance, columns) / (std**2 * inflation)
@@ -472,15 +473,15 @@ def tempered_prior(
 ) -> Prior:
     """Return the prior with the tempering that best predicts held-out ranges of motion.
 
-    Errors are squares of all rows, each in units of its residuals, and their geometric mean over the regimes: where
-    one kind of extreme is hard for every prior it decides no more than the others. A stronger prior has to be better by
+    The criterion is the squared error of all rows, in units of their residuals, as geometric mean over the regimes, so
+    that a regime with large errors for every prior does not dominate. A stronger prior must be better by
     `MIN_TEMPERING_GAIN`.
 
     Args:
         find: `find_prior` of rows, a prior to start from, and a tempering.
         prior: the prior with the least of `TEMPERINGS`.
-        rows: in the base columns.
-        regimes: of these rows.
+        rows: rows in the base columns.
+        regimes: regimes of these rows.
     """
     data = triangulate(rows)
     columns = np.arange(len(rows[0].names))

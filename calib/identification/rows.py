@@ -39,11 +39,11 @@ class Case:
         motion: q, v, a at the full rate.
         target: (N, rows) torques to explain, unfiltered [N m or N; A where no gain is known].
         carried: labels of the mounted payloads.
-        present: (N, rows) which rows may be used: without lost samples.
+        present: (N, rows) bool, which rows may be used; False at lost samples.
         noise: (rows,) standard deviation of the targets' samples, as estimated from repeats of the motion; None: not
             known.
         torque_rows: kind of torques in the target.
-        link: q, v, a (N, n) of the links, where joint corrections part them from the motors' motion; None: the same.
+        link: motion q, v, a (N, n) of the links, where joint corrections make it differ from the motors'; None: equal.
     """
 
     name: str
@@ -140,8 +140,8 @@ class RestWeights:
     """Weights of standstills, see `calib.identification.standstill`.
 
     Attributes:
-        worth: (rows,) how many rows in motion a value of the friction at rest weighs.
-        count: (rows,) how many rows it counts as where residuals are averaged.
+        worth: (rows,) weight of one value of the friction at rest, in rows in motion.
+        count: (rows,) number of rows that one value counts as where residuals are averaged.
         reach: (rows,) change of torque [N m or N] after which the friction has another value.
     """
 
@@ -156,14 +156,15 @@ class ObservationRows:
 
     Attributes:
         names, units: names and units of the p columns.
-        matrix: (M, rows, p).
-        target: (M, rows).
+        matrix: (M, rows, p) observation matrix W.
+        target: (M, rows) torques y.
         present: (M, rows) bool, rows for training.
         block: (M,) number of the time block, for cross-validation; -1 next to a cut.
         rate: sampling rate [Hz].
-        standing: (M, rows) share of its standstill that each row is; 0 in motion.
-        swing: (M, rows) range of the torque in that standstill [N m or N]; 0 in motion.
-        breakaway: (M, rows) factor of each row in motion: less than 1 where friction at rest still fades.
+        standing: (M, rows) share of each row in its standstill; 0 in motion.
+        swing: (M, rows) range of the torque in the row's standstill [N m or N]; 0 in motion.
+        breakaway: (M, rows) factor of each row in motion: less than 1 where friction at rest still decays after a
+            standstill.
         rest: weights of standstills.
         coulomb: (rows, p) columns that are Coulomb friction of a torque row.
     """
@@ -201,7 +202,7 @@ class ObservationRows:
     def by_recording(self, recording: int, count: int) -> ObservationRows:
         """Return rows with separate torque rows per recording: those of one `recording` of `count` are filled.
 
-        So that recordings are weighed separately, as joints are where a sample has a row for each.
+        Recordings can then be weighted separately, as joints are.
         """
         filled = np.arange(count) == recording
         matrix = np.where(filled[:, None], self.matrix, 0.0)
@@ -245,7 +246,8 @@ class ObservationRows:
 def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: Decimator) -> ObservationRows:
     """Return the rows of a case in the model's `columns`, filtered and decimated by `decimator`.
 
-    A body's parameters reach the joints before it, a drive's its own: half of all entries, or less, can differ from 0.
+    Only entries that can differ from 0 are computed: a body's parameters act on the joints before it, a drive's on its
+    own joint.
     """
     motion = case.motion
     segment = motion.segment
@@ -449,8 +451,8 @@ def power_block(
 ) -> np.ndarray:
     """Return entries (k, N_i) of the power regressor: d/dt h of energies, vᵀ W of the other columns.
 
-    No acceleration takes part. Differences and the filter of the decimation are linear and do not mind which comes
-    first: this is the derivative of the filtered energies (Gautier 1997; Gautier & Briot 2013).
+    No accelerations are used. Differences and the decimation filter are linear and commute: the result is the
+    derivative of the filtered energies (Gautier 1997; Gautier & Briot 2013).
     """
     if not isinstance(model, _HasEnergy):
         raise UsageError("rows = 'power' requires a model with energies")

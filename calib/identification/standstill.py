@@ -1,26 +1,26 @@
-"""Standing joints: each standstill counts once, its friction unknown within the static friction.
+"""Joints at rest: each standstill counts as one row, with friction unknown within the static friction.
 
 While a joint stands, friction takes any value that keeps it there. Of a standstill of K rows the torques are
 
     y_k = w_k x + f + e_k,    abs(f) <= F_s unknown,
 
-w without the friction that only the direction of motion decides (Coulomb's and its kin). The K rows share one f, so
-that together they say as much as one row of variance τ s² / K + f², where s² is the variance of the residuals in
-motion, τ how many neighbouring ones count as one, and
+w without friction that depends only on the direction of motion (Coulomb friction and similar). The K rows share one f,
+so that together they have the information of one row of variance τ s² / K + f², where s² is the variance of the
+residuals in motion, τ the number of neighbouring residuals that count as one, and
 
     f² = max(F_c² / 3, mean square of the residuals at rest),
 
 F_c² / 3 being the variance of a value that may be anywhere within ± F_c. Rows of the standstill share this weight
-evenly, so that they still say how the torque changes with what other joints do. Where that changes it by more than the
-friction spans, friction has taken another value: a standstill whose torque ranges over r counts as 1 + r / reach
-values, reach = 2 √3 √(f² + τ s²), the width of an even distribution of that variance.
+evenly, so that they still show how the torque changes with the motion of other joints. Where the torque changes by more
+than the range of friction, friction has taken another value: a standstill whose torque ranges over r counts as 1 + r /
+reach values, reach = 2 √3 √(f² + τ s²), the width of an even distribution of that variance.
 
-After it friction is not at once that of motion: gears unwind, and contacts give way. What it was at rest fades over a
-travel δ, so that a row at the travel d since the last standstill has the variance
+After a standstill friction does not at once have its value in motion: gears unwind, and contacts give way. Its value at
+rest decays over a travel δ, so that a row at the travel d since the last standstill has the variance
 
     s² + f² exp(-2 d / δ),
 
-δ being one for the robot, as likely as possible by the residuals of a fit among `TRAVELS` (0: it fades at once). On
+δ being one value for the robot, the most likely of `TRAVELS` given the residuals of a fit (0: no delay). On
 the KR300 it is some 5 to 20 mrad, on harmonic drives 1 mrad.
 
 Reversals pass through zero speed and stay rows as others: shorter than `MIN_STANDSTILL`, or, of slow motion, as often
@@ -28,8 +28,8 @@ at one small speed as at another, where a joint that stands is slower than `MAX_
 sensors behind the gear have no such friction.
 
 Where the drive's friction is low, or the model of the motion is wrong (a torso whose effort holds no gravity), rows at
-rest say more than this. Both treatments predict the motion of time blocks that they were not fitted to; standing rows
-count as any others where that errs less than `CLEARLY_LESS` times as much.
+rest have more information than this. Both treatments therefore predict the motion of held-out time blocks; rows at rest
+count like all others where the error is then less than `CLEARLY_LESS` times as large.
 """
 
 from __future__ import annotations
@@ -170,14 +170,15 @@ def _swings(mask: np.ndarray, target: np.ndarray, segment: np.ndarray) -> np.nda
 
 @dataclass(frozen=True, eq=False)
 class DividedRows:
-    """R factors of moving rows and of standing ones apart, one group per torque row, so that their weights may change.
+    """Separate R factors of rows in motion and at rest, one group per torque row, so that weights may change.
 
     Attributes:
-        moving, standing: the latter's rows scaled by the root of their share of a standstill.
-        swinging: standing rows scaled by the root of that share times the range of the torque.
-        standstills: (rows,) how many there are.
-        swing: (rows,) mean range of the torque in one [N m or N].
-        length: (rows,) their mean number of rows.
+        moving, standing: R factors of rows in motion, and of rows at rest scaled by the root of their share of a
+            standstill.
+        swinging: R factors of rows at rest scaled by the root of that share times the range of the torque.
+        standstills: (rows,) number of standstills.
+        swing: (rows,) mean range of the torque in a standstill [N m or N].
+        length: (rows,) mean number of rows of a standstill.
         coulomb: (rows, p) which columns are Coulomb friction of a torque row.
     """
 
@@ -260,10 +261,10 @@ def with_breakaway(
     torque_rows: TorqueRows,
     values: np.ndarray,
 ) -> list[ObservationRows]:
-    """Return rows after standstills weighed by how far friction is on its way to the value of motion, see the module.
+    """Return rows weighted by how far friction after a standstill has approached its value in motion, see the module.
 
     Args:
-        values: (p,) of a fit, whose residuals say over which travel that is.
+        values: (p,) parameters of a fit, from whose residuals the travel δ is estimated.
     """
     parts = divided(all_rows)
     spread = parts.standing.residual_squares(values) / np.maximum(parts.standstills, 1.0)
@@ -343,11 +344,11 @@ def left_out_error(
     torques are fitted by wrong parameters would count most.
 
     Args:
-        training: rows with the treatment of standstills that is judged.
+        training: rows with the tested treatment of standstills.
         marked: the same samples with their standstills marked.
         std, inflation: (rows,) standard deviation and variance inflation of the residuals.
         prior: whitened rows (k, p + 1) of [W y]; None without one.
-        apart: rows in a unit of their own, which no total holds.
+        apart: rows in a different unit, excluded from the sum.
     """
     rows = training[0].target.shape[1]
     data = triangulate(training)

@@ -1,9 +1,8 @@
 """Cross-validation of models over time blocks: computed from R factors, one fit per fold.
 
-Regimes of a motion, on which models are judged without having been fitted to them, are each joint's extremes. A model
-that is right goes on being right where a joint is faster, accelerates more, or stands farther out than in its training
-data, and in the direction of travel that it has not seen. Blocks of time hardly ask for that: each holds some of
-everything.
+Models are also tested on held-out regimes of a motion, the extremes of each joint: a correct model extrapolates to
+higher speeds and accelerations, positions farther out, and the other direction of travel. Time blocks hardly test this,
+since each contains some of every regime.
 """
 
 from collections.abc import Sequence
@@ -44,7 +43,7 @@ class Regimes:
 def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimator: Decimator) -> Regimes:
     """Return the products of cases by range of motion: fast, accelerated, at each end of travel, each direction.
 
-    Standstills belong to none: no model is judged by friction that nothing decides.
+    Standstills belong to no regime, since friction at rest is undetermined.
     """
     positions = []
     speeds = []
@@ -220,7 +219,7 @@ def estimate(
     """Return values (p,) and prior standard deviations (p,): infinite without ridge, 0 for columns switched off.
 
     Columns with a group are regularised towards zero as strongly as the evidence says (`calib.estimation.relevance`);
-    with none, this is weighted least squares. Directions without any data stay where they are: at zero.
+    with none, this is weighted least squares. Directions without any data remain zero.
     """
     weight = 1.0 / (std * np.sqrt(inflation))
     weighted = data.factors * weight[:, None, None]

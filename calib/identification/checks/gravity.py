@@ -1,17 +1,18 @@
-"""Gravity as a hypothesis: the stated vector, another direction, or torques that hold none at some joints.
+"""Test of gravity: is it the stated vector, another direction, or absent from the torques of some joints?
 
 For stated masses torque is linear in the gravity vector g, and for a stated g in the masses χ:
 
     τ = Y(q, v, a; 0) χ + Σ_k g_k Y_k(q) χ + drives,    k = x, y, z in the base frame.
 
-So each direction costs one least-squares fit of bodies of any masses, from products that are computed once, and all
-directions together have a bound that costs one more: masses of their own for each of x, y, z. Magnitude stays the
-stated one's, since only the ratio of masses to inertias tells it (`recording_sizes.ClockRatio`). Masses that may be
-negative fit -g nearly as well as g in slow motion; in fast motion the same first moments bend the inertias.
+So each direction needs one least-squares fit of bodies with any masses, from products that are computed once. One
+further fit, with separate masses for each of x, y, z, bounds the residual of all directions. The magnitude remains the
+stated one, since only the ratio of masses to inertias identifies it (`recording_sizes.ClockRatio`). Masses that may be
+negative fit -g nearly as well as g in slow motion; in fast motion the first moments must also fit the inertial torques.
 
-Whether a joint's torque holds gravity at all is another question: bodies without mass explain torques without
-gravity. There the gravity torque of the robot's masses (else of rods, as large as their inertias are) is fitted to each
-joint, beside motion and drive. An arm whose joints all turn about the vertical shows neither, and nothing is said.
+Whether a joint's torque contains gravity at all is tested separately, since bodies without mass explain torques without
+gravity: the gravity torque of the robot's masses (without masses, of rods scaled by their inertias) is fitted to each
+joint, together with the torques of motion and drive. An arm whose joints all turn about the vertical identifies
+neither, and no statement is made.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -63,17 +64,17 @@ DIRECTIONS = 60
 
 @dataclass(frozen=True, eq=False)
 class GravityHypotheses:
-    """What the torques of a recorded motion say of gravity.
+    """Gravity as identified from the torques of recorded motions, compared with the stated vector.
 
     Attributes:
-        stated: (3,) in the base frame [m/s²].
-        before: (n,) unexplained share of the joints' rms torque with it.
-        direction: (3,) another one of the same magnitude that explains the torques; None without any.
-        after: (n,) unexplained share with it; that with the stated one where there is none.
-        ambiguous: whether its opposite, or yet another direction, explains as much.
-        absent: joints, from 0, whose torques hold no gravity.
-        factors: (n,) gravity torque over the expected one; NaN where the motion does not tell.
-        sigmas: (n,) of `factors`.
+        stated: (3,) stated gravity vector in the base frame [m/s²].
+        before: (n,) unexplained share of the joints' rms torque with the stated vector.
+        direction: (3,) another vector of the same magnitude that explains the torques; None if there is none.
+        after: (n,) unexplained share with `direction`; equal to `before` if that is None.
+        ambiguous: whether the opposite of `direction`, or a third direction, explains as much.
+        absent: joints, from 0, whose torques contain no gravity.
+        factors: (n,) gravity torque over the expected one; NaN where the motion does not identify it.
+        sigmas: (n,) standard deviations of `factors`.
     """
 
     stated: np.ndarray
@@ -87,7 +88,7 @@ class GravityHypotheses:
 
     @property
     def factor(self) -> float:
-        """Ratio of the rms residuals with the other direction and with the stated one, their geometric mean."""
+        """Ratio of rms residuals with the other direction and with the stated one, geometric mean over the joints."""
         ratio = self.after / self.before
         return float(np.exp(np.mean(np.log(ratio))))
 
@@ -98,12 +99,12 @@ class GravityHypotheses:
 
 
 def gravity_of(motions: Sequence[MotionSamples], chain: Chain, newtons: bool = True) -> GravityHypotheses:
-    """Return what recordings of one robot, all mounted alike, say of gravity.
+    """Return gravity as identified from recordings of one robot in one mounting, compared with the stated vector.
 
     Args:
-        motions: samples of the recordings, their bodies under the stated gravity.
-        chain: the arm, whose masses count where it has any.
-        newtons: whether torques are in N m; of those in another unit only proportions count.
+        motions: samples of the recordings; their bodies have the stated gravity.
+        chain: the arm; its masses are used if it has any.
+        newtons: whether torques are in N m; in another unit only their proportions are used.
     """
     sums = _GravitySums(motions)
     stated = np.array(motions[0].bodies.gravity)
@@ -132,12 +133,12 @@ def gravity_of(motions: Sequence[MotionSamples], chain: Chain, newtons: bool = T
 
 
 def _another_direction(sums: "_GravitySums", stated: np.ndarray, before: np.ndarray) -> np.ndarray | None:
-    """Return the gravity vector (3,) of the stated one's magnitude that explains the torques instead; None if it does.
+    """Return the gravity vector (3,) that explains the torques better than the stated one; None if there is none.
 
     Args:
         sums: products of the motions.
-        stated: (3,) gravity vector.
-        before: (n,) unexplained shares with it.
+        stated: (3,) stated gravity vector; the returned one has its magnitude.
+        before: (n,) unexplained shares with the stated vector.
     """
     bound = sums.bound()
     if _mean(bound / before) > MAX_LEFT:
@@ -154,14 +155,14 @@ def _another_direction(sums: "_GravitySums", stated: np.ndarray, before: np.ndar
 def _without_gravity(
     sums: "_GravitySums", gravity: np.ndarray, unexplained: np.ndarray, candidates: Sequence[int]
 ) -> tuple[int, ...]:
-    """Return the joints whose torques hold no gravity: those that are better explained without.
+    """Return the joints whose torques contain no gravity: those better explained without it.
 
     Args:
         sums: products of the motions.
         gravity: (3,) gravity vector.
         unexplained: (n,) unexplained shares with gravity at all joints.
-        candidates: joints whose torques lack what is expected of the robot's masses: it is enough that they are
-            explained as well.
+        candidates: joints whose torques lack the gravity expected of the robot's masses; for these it suffices that the
+            fit without gravity is as good.
     """
     absent: list[int] = []
     if candidates:
@@ -182,7 +183,10 @@ def _without_gravity(
 
 
 class _GravitySums:
-    """Products of the columns of motions by joint: bodies in motion without gravity, in each of x, y, z, and drives."""
+    """Products WᵀW by joint, summed over motions.
+
+    The columns W are those of bodies in motion without gravity, of bodies under gravity along x, y, z, and of drives.
+    """
 
     def __init__(self, motions: Sequence[MotionSamples]) -> None:
         """Sum the products WᵀW of all motions, joint by joint."""
@@ -196,8 +200,8 @@ class _GravitySums:
         """Return the unexplained share (n,) of the joints' rms torques under a gravity vector (3,).
 
         Args:
-            gravity: in the base frame.
-            without: joints, from 0, whose torques hold none.
+            gravity: (3,) vector in the base frame [m/s²].
+            without: joints, from 0, whose torques contain no gravity.
         """
         squares = np.array(self.squares)
         for joint in without:
@@ -206,11 +210,11 @@ class _GravitySums:
         return self._unexplained(self._under(gravity), squares)
 
     def bound(self) -> np.ndarray:
-        """Return the unexplained share (n,) where each axis of the base has masses of its own."""
+        """Return the unexplained share (n,) with separate masses for each axis: a lower bound for any direction."""
         return self._unexplained(np.eye(self.squares.shape[1]), self.squares)
 
     def cost(self, unexplained: np.ndarray) -> Callable[[np.ndarray], float]:
-        """Return a function from a gravity vector (3,) to the sum of squares, joints weighed by unexplained shares."""
+        """Return a function from a gravity vector (3,) to the sum of squares, weighted by unexplained shares (n,)."""
         weight = 1.0 / (unexplained**2 * self.power)
         total = np.tensordot(weight, self.squares, 1)
 
@@ -223,7 +227,7 @@ class _GravitySums:
         return squares
 
     def _under(self, gravity: np.ndarray) -> np.ndarray:
-        """Return the matrix (k, p + 1) from the columns of bodies under a gravity vector (3,) to all columns."""
+        """Return the matrix (k, p + 1) that maps columns of bodies under a gravity vector (3,) to all k columns."""
         inertial = np.eye(10 * self.bodies)
         by_body = inertial.reshape(self.bodies, 10, -1)
         masses = by_body[:, MASSES].reshape(4 * self.bodies, -1)
@@ -235,7 +239,7 @@ class _GravitySums:
         return np.block([[bodies, beside_bodies], [beside_drives, drives]])
 
     def _unexplained(self, change: np.ndarray, squares: np.ndarray) -> np.ndarray:
-        """Return the unexplained shares (n,) of products by joint, their columns changed by a matrix (k, p + 1)."""
+        """Return the unexplained shares (n,) with columns mapped by a matrix `change` (k, p + 1)."""
         residual = self.power
         for _ in range(ROUNDS):
             weight = 1.0 / np.maximum(residual, 1e-12 * self.power)
@@ -268,7 +272,7 @@ def _columns(motion: MotionSamples) -> np.ndarray:
 
 
 def _solved(square: np.ndarray) -> np.ndarray:
-    """Return the least-squares solution (p,) of [W y]ᵀ[W y] (p + 1, p + 1), directions without data left at zero."""
+    """Return the least-squares solution (p,) from [W y]ᵀ[W y] (p + 1, p + 1), zero in directions without data."""
     size = np.sqrt(np.diag(square)[:-1])
     scale = np.where(size > 1e-9 * size.max(), size, np.inf)
     scaled = square[:-1, :-1] / (scale[:, None] * scale)
@@ -283,7 +287,7 @@ def _mean(ratios: np.ndarray) -> float:
 
 
 def _angle(first: np.ndarray, second: np.ndarray) -> float:
-    """Return the angle between two vectors (3,) [rad]; a right one where one of them is zero."""
+    """Return the angle between two vectors (3,) [rad]; a right angle if one of them is zero."""
     size = float(np.linalg.norm(first) * np.linalg.norm(second))
     if not size > 0.0:
         return 0.5 * np.pi
@@ -291,9 +295,10 @@ def _angle(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def _best_direction(sums: _GravitySums, magnitude: float, unexplained: np.ndarray) -> np.ndarray:
-    """Return the gravity vector (3,) of a magnitude [m/s²] that leaves least unexplained, of both signs either.
+    """Return the gravity vector (3,) of a magnitude [m/s²] with the smallest residual, of both signs.
 
-    Joints are weighed by what masses of their own for each axis leave of them (n,), then by what the direction leaves.
+    Joints are weighted by their unexplained share (n,) with separate masses for each axis, then by that with the
+    direction.
     """
     cost = sums.cost(unexplained)
     axis = min(magnitude * _half_sphere(DIRECTIONS), key=cost)
@@ -305,7 +310,7 @@ def _best_direction(sums: _GravitySums, magnitude: float, unexplained: np.ndarra
 
 
 def _refined(cost: Callable[[np.ndarray], float], start: np.ndarray) -> np.ndarray:
-    """Return the vector (3,) of least cost near `start`, of the same size."""
+    """Return the vector (3,) of least cost near `start`, of the same length."""
     # Imported here because it is slow to load.
     from scipy.optimize import minimize
 
@@ -337,12 +342,13 @@ def _half_sphere(count: int) -> np.ndarray:
 def _gravity_factors(
     motions: Sequence[MotionSamples], chain: Chain, gravity: np.ndarray, newtons: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the joints' gravity torques over those expected under a vector (3,), and their sigmas, (n,) each.
+    """Return the joints' gravity torques over those expected under a gravity vector (3,), and their sigmas, (n,) each.
 
-    The third array says where the expected torque of gravity varies more than the whole recorded one.
+    The third array is a mask (n,) of joints whose expected gravity torque varies more than the whole recorded torque.
 
-    Each joint's torque is that of gravity by the robot's masses, that of motion by its inertias, each times a factor,
-    and that of its drive. NaN where no gravity torque is expected, or motion and friction look like it.
+    Each joint's torque is modelled as gravity of the robot's masses times a factor, motion of its inertias times a
+    factor, and the drive's torque. NaN where no gravity torque is expected, or motion and friction are not
+    distinguishable from it.
     """
     n = chain.n
     factors = np.full(n, np.nan)
@@ -389,7 +395,7 @@ def _gravity_factors(
 
 
 def _inertia_factor(motions: Sequence[MotionSamples], reference: np.ndarray) -> float:
-    """Return the robot's inertias over those of bodies (10 B,), whatever gravity is; NaN where motion does not tell."""
+    """Return ratio of the robot's inertias to those of bodies (10 B,), for any gravity; NaN where not identified."""
     moving = []
     free = []
     torque = []

@@ -1,8 +1,8 @@
 """Checks of a recording against the designed motion and the robot's nominal masses.
 
-Everything is looked at on a coarse common grid; `calib.trajectories.recall` finds the motion and its repetitions. What
-quick
-looks at torques share stands here, too: a few samples of a recording, and how much columns explain of its torques.
+All comparisons use a coarse common time grid; `calib.trajectories.recall` finds the motion and its repetitions. This
+module also has what the quick checks of torques share: a few samples of a recording, and the share of its torques that
+columns explain.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -66,8 +66,9 @@ class LocatedMotion:
     """Location of a designed motion in a recording.
 
     Attributes:
-        start, stop: of the complete repetitions with a short margin [s], in the recording's time.
-        began: of the first of them, where the positions match best [s]: later than asked for by the tracking lag.
+        start, stop: start and end of the complete repetitions, with a short margin [s], in the recording's time.
+        began: start of the first repetition, where the positions match best [s]: later than commanded by the tracking
+            lag.
         periods: number of complete repetitions.
         tracking: (n,) rms of recorded minus designed positions [rad or m].
         likeness: smallest share of the motion's variance that a recorded period explains.
@@ -115,12 +116,12 @@ def locate(recording: Recording, motion: DesignedMotion) -> LocatedMotion | None
 def another_motion(
     recording: Recording, motion: DesignedMotion, alternatives: Mapping[str, DesignedMotion]
 ) -> Change | None:
-    """Return the change of the designed motion that explains a recording, e.g. other units; None if no tested one does.
+    """Return the change of the designed motion that explains a recording, e.g. other units; None if none tested does.
 
     Args:
-        recording: of n joints.
-        motion: the one that was to be played; it is tried at other `SPEEDS`, in other `UNITS`, with its columns swapped
-            and reversed, and with joints that count from the one before them.
+        recording: recording of n joints.
+        motion: the motion that should have been played; it is tried at other `SPEEDS`, in other `UNITS`, with its
+            columns swapped and reversed, and with joints that count from the one before them.
         alternatives: designed motions by name, one of which may have been played instead.
     """
     _, q = _on_grid(recording)
@@ -172,14 +173,14 @@ def _sampled(t: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
 
 
 def _one_period(motion: DesignedMotion, speed: float = 1.0) -> np.ndarray:
-    """Return the positions (P, n) of one period of a motion, sampled about every `STEP`, at `speed` times its speed."""
+    """Return positions (P, n) of one period of a motion at `speed` times its speed, sampled about every `STEP` [s]."""
     count = round(motion.period / speed / STEP)
     q, _, _ = motion.orders(np.arange(count) * motion.period / count)
     return q
 
 
 def _recalled(q: np.ndarray, reference: np.ndarray) -> Recalled | None:
-    """Return the periods of a motion (P, n) in positions (N, n); None if these contain none."""
+    """Return the periods of a motion (P, n) found in positions (N, n); None if there are none."""
     try:
         return find_periods(q, reference, likeness=MIN_LIKENESS)
     except BadInput:
@@ -187,7 +188,7 @@ def _recalled(q: np.ndarray, reference: np.ndarray) -> Recalled | None:
 
 
 def _unlike(data: Pair) -> np.ndarray:
-    """Return the share (1,) of a motion's variance that the worst recorded period leaves unexplained; 1 if none is."""
+    """Return the share (1,) of variance that the worst recorded period leaves unexplained; 1 without periods."""
     q, reference = data
     recalled = _recalled(q, reference)
     if recalled is None:
@@ -222,19 +223,19 @@ def share_of_nominal(
 ) -> np.ndarray:
     """Return the ratios (n,) of recorded torques to those of the nominal masses, with the drives estimated as well.
 
-    Least squares of τ_j on [τ_nominal,j, a_j, v_j, tanh(v_j / v0), 1] on the coarse grid: without the rotor's inertia
-    (a_j) it is taken for mass. A joint counts where its rigid-body torque is more than `MIN_TORQUE` of its limit and
-    the partial correlation of both torques is above `MIN_SIGN_CORRELATION`.
+    Least squares of τ_j on [τ_nominal,j, a_j, v_j, tanh(v_j / v0), 1] on the coarse grid; a_j is the column of the
+    rotor's inertia, which would otherwise appear as mass. A joint is judged where its rigid-body torque is more than
+    `MIN_TORQUE` of its limit and the partial correlation of both torques is above `MIN_SIGN_CORRELATION`.
 
     Args:
-        t: (N,) [s].
-        q, effort: (N, n).
+        t: (N,) sample times [s].
+        q, effort: (N, n) positions [rad or m] and torques.
         chain: the arm with its nominal masses.
-        gravity: [m/s²], where it is not the robot's own.
-        static: compare torques of gravity alone, the others left free like the drives'.
+        gravity: (3,) [m/s²]; None: the chain's own.
+        static: whether only gravity torques are compared, with the torques of motion free parameters like the drives'.
 
     Returns:
-        (n,) factors on τ_nominal: 1 for right masses, below 0 for a reversed sign; NaN for joints that do not count.
+        (n,) factors on τ_nominal: 1 for right masses, below 0 for a reversed sign; NaN for joints that are not judged.
     """
     grid = _coarse(t)
     torque = _smooth(_sampled(t, effort, grid))
@@ -268,7 +269,7 @@ def share_of_nominal(
 
 
 def _without(columns: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return what the least-squares combination of columns (N, k) leaves of values (N,)."""
+    """Return the residual (N,) of values (N,) after least squares on columns (N, k)."""
     return values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0]
 
 
@@ -296,8 +297,8 @@ class MotionSamples:
 
     Attributes:
         index: (N,) indices of the samples in the motion.
-        q, v, a: (N, n).
-        effort: torques of the whole motion, smoothed; velocity: of the whole motion.
+        q, v, a: (N, n) [rad or m, per s, per s²].
+        effort, velocity: smoothed torques, and velocities, of the whole motion (all samples, n).
         bodies: rigid bodies of the robot.
     """
 
@@ -369,7 +370,7 @@ def basis(columns: np.ndarray) -> np.ndarray:
 
 
 def spanning(square: np.ndarray) -> np.ndarray:
-    """Return the matrix (p, k) that turns columns W into an orthonormal basis of their space, from WᵀW (p, p)."""
+    """Return the matrix (p, k) that maps columns W to an orthonormal basis of their space, from WᵀW (p, p)."""
     size = np.sqrt(np.diag(square))
     nonzero = np.flatnonzero(size > 1e-9 * size.max())
     nonzero_size = size[nonzero]

@@ -1,15 +1,15 @@
 """Checks whether a recording belongs to a robot: masses, limits, joints' signs, order and zeros, and the clock.
 
-Numbers only; what they mean for a verdict is said in `calib.procedure.dynamic_stage.plausibility`. Everything is looked
-at on a few samples. All thresholds are our choice; on the real recordings at hand (Panda, KR300, LWR4+, TX40, TIAGo, 22
-of a UR10e) none is reached.
+Only numbers are computed here; `calib.procedure.dynamic_stage.plausibility` turns them into findings. All checks use a
+few samples. All thresholds are our choice; on the real recordings at hand (Panda, KR300, LWR4+, TX40, TIAGo, 22 of a
+UR10e) none is reached.
 
 A clock that runs s times too slow makes accelerations s² times too small, so that inertias come out s² times too large
-while masses, which gravity identifies, stay as they are. How large inertias are compared with masses, lengths alone say
-nearly: for rods between the joints their ratio is known up to 17 % on every recording at hand that identifies it
-(Panda, LWR4+, TX40, 11 of a UR10e), whatever the masses and the unit of the torques are. All these have six joints or
-more; arms of two, whose last link has no known length, are not looked at: one gave 45. A simulated TX40 gave 0.46; so
-where the description has masses, inertias are compared with these if they are nearer (0.9 to 1.2 on these recordings).
+while masses, which gravity identifies, stay as they are. The ratio of inertias to masses nearly follows from lengths
+alone: that of rods between the joints is right up to 17 % on every recording at hand that identifies it (Panda, LWR4+,
+TX40, 11 of a UR10e), whatever the masses and the unit of the torques are. All these have six joints or more; arms of
+two, whose last link has no known length, are not checked: one gave 45. A simulated TX40 gave 0.46; so where the
+description has masses, inertias are compared with these if they are nearer (0.9 to 1.2 on these recordings).
 """
 
 from collections.abc import Callable, Sequence
@@ -74,7 +74,7 @@ INDEPENDENT_ERRORS = 6
 
 @dataclass(frozen=True)
 class ClockRatio:
-    """Ratio of identified inertias to masses, relative to that of rods between the joints, and its relative sigma."""
+    """Ratio of identified inertias to masses, divided by that of rods between the joints, and its relative sigma."""
 
     ratio: float
     relative_sigma: float
@@ -88,9 +88,9 @@ class ClockRatio:
 def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
     """Return the ratio of inertias to masses; None if the motion or the arm does not identify both.
 
-    Torques are τ = α τ_rods + free: α of the rods' torques of motion beside any torque of gravity, then α of their
-    gravity beside any torque of motion; drives free in both. Where the description has masses, the ratio to theirs
-    counts if it is nearer to 1.
+    Torques are modelled as τ = α τ_rods + free, twice: first α scales the rods' torques of motion, with any torque of
+    gravity free; then α scales their gravity torques, with any torque of motion free. Drives are free in both. Where
+    the description has masses, the ratio relative to these is returned if it is nearer to 1.
     """
     if chain.n < MIN_JOINTS:
         return None
@@ -108,7 +108,7 @@ def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
 
 
 def _ratio_to(robot: np.ndarray, samples: MotionSamples) -> ClockRatio | None:
-    """Return the ratio of inertias to masses over that of bodies (10 B,); None where it is not identified."""
+    """Return the ratio of inertias to masses, divided by that of bodies (10 B,); None where it is not identified."""
     of_gravity = samples.at_rest
     of_motion = samples.inertial - of_gravity
     beside_motion = np.concatenate([of_gravity, samples.drives], axis=2)
@@ -122,7 +122,7 @@ def _ratio_to(robot: np.ndarray, samples: MotionSamples) -> ClockRatio | None:
 
 
 def common_factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray) -> tuple[float, float]:
-    """Return α of torques τ (m, n) = α common + free x and its sigma, each joint weighted by its residual."""
+    """Return α of torques τ (m, n) = α `common` + `free` x, and its sigma, each joint weighted by its residual."""
     m, n = torque.shape
     min_deviation = 1e-9 * max(float(torque.std()), 1e-300)
     weight = np.ones(n)
@@ -155,9 +155,8 @@ def _without(orthonormal: np.ndarray, values: np.ndarray) -> np.ndarray:
 def wrong_joints(samples: MotionSamples) -> Explanation | None:
     """Return the joints with reversed or exchanged torques, or coupled positions; None if all joints are right.
 
-    One model of all joints is fitted to each: bodies and offsets of any size, Ia, Fv and Fc of every drive not
-    negative, since no drive brakes backwards. The robot's own masses need not be known. Residuals are shares of the
-    joints' torques.
+    For each tested change one model of all joints is fitted: bodies and offsets of any size, non-negative Ia, Fv and Fc
+    of every drive. The robot's masses need not be known. Residuals are shares of the joints' torques.
     """
     n = samples.q.shape[1]
     unexplained_shares = cache(_unexplained_function)
@@ -183,9 +182,9 @@ def wrong_joints(samples: MotionSamples) -> Explanation | None:
 
 
 def _unexplained_function(samples: MotionSamples) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function from torques by joint to the unexplained share of each one's variance (n,).
+    """Return a function from a mixing of the torques to the unexplained share of each joint's variance (n,).
 
-    Its argument (n, n) mixes the recorded columns: the identity, with signs reversed or rows exchanged.
+    Its argument (n, n) mixes the recorded torque columns: the identity, with signs reversed or rows exchanged.
     """
     m, n = samples.q.shape
     scale = 1.0 / np.maximum(samples.torque.std(axis=0), 1e-12)
@@ -216,9 +215,9 @@ def _unexplained_function(samples: MotionSamples) -> Callable[[np.ndarray], np.n
 
 
 def rearranged(samples: MotionSamples, chain: Chain) -> Explanation | None:
-    """Return the exchange of two joints or the zero offset of one joint that best explains the torques, or None.
+    """Return the exchange of two joints or zero offset of one joint that best explains the torques; None if none does.
 
-    The torques are those of the robot's own masses, and residuals are shares of the variance of each joint's torque.
+    The torques are predicted from the robot's masses; residuals are shares of the variance of each joint's torque.
     """
     n = chain.n
     masses = standard_parameters(chain)
@@ -255,10 +254,10 @@ def _changed(samples: MotionSamples, matrix: np.ndarray) -> MotionSamples:
 
 
 def _unexplained_by_masses(samples: MotionSamples, masses: np.ndarray) -> np.ndarray:
-    """Return the unexplained share of each joint's torque variance (n,).
+    """Return the share (n,) of each joint's torque variance that the robot's masses do not explain.
 
-    Each torque is that of gravity and that of motion, by the robot's masses, each times a factor, its own drive and
-    those of the joints beside it: wrists are coupled by their gears, which an exchange would seem to explain.
+    Each torque is modelled by gravity and motion of the robot's masses, each times a factor, by the joint's drive and
+    by those of the neighbouring joints: wrists are coupled by their gears, which could be mistaken for an exchange.
     """
     q = samples.q
     v = samples.v
@@ -284,17 +283,18 @@ class RecordingSizes:
 
     Attributes:
         name: name of the case.
-        masses: (n,) recorded gravity torque over that of the nominal masses; NaN where a joint does not identify it.
-        limits: (n,) torques over the joints' limits, without the largest 1 % of them; NaN where no limit is known.
+        masses: (n,) recorded gravity torque over that of the nominal masses; NaN where it is not identified.
+        limits: (n,) largest torque, ignoring the largest 1 %, over the joint's limit; NaN where no limit is known.
         speed: (n,) measured velocities over the slopes of the positions; NaN without velocities or travel, or
             where the two are not correlated.
         speed_sigma: (n,) sigma of `speed`.
         follows: (n,) correlation of the measured velocities' integrals with the positions; NaN without travel.
         counted: whether the samples' times are computed from the measured velocities.
-        rate: sampling rate, by the samples' times [Hz].
+        rate: sampling rate according to the time stamps [Hz].
         lag: lag of the torques; None where the recording is too short to estimate it.
         clock: ratio of inertias to masses; None where the motion does not identify it.
-        other: change of the columns with which the masses explain more; None if no change does, or none was tested.
+        other: change of the columns with which the masses explain the torques better; None if no change does, or none
+            was tested.
         jumps: text on jumps of the positions.
     """
 
@@ -319,9 +319,9 @@ def compare_sizes(
 
     Args:
         case: a recording.
-        chain: the arm, whose masses count where it has any.
-        gravity: in the base frame [m/s²], where it is not the robot's own.
-        newtons: whether the torques are in N m; those of currents without known gains compare with no masses.
+        chain: the arm; its masses are used if it has any.
+        gravity: (3,) in the base frame [m/s²]; None: the robot's own.
+        newtons: whether the torques are in N m; torques from currents without known gains are not compared with masses.
     """
     motion = case.motion
     unknown = np.full(chain.n, np.nan)
@@ -381,9 +381,9 @@ def _speed_ratio(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return ratios of measured velocities to differentiated positions, their sigmas, and correlations, (n,) each.
 
-    That is ∫v dt on q, both without their trend: integrals compare where slopes are noise; each segment (N,) by itself,
-    since nobody knows the speed in a gap. Of a short motion little is left beside its trend, while an error of the
-    dates moves the whole travel. NaN for joints that hardly travel, and the ratio where velocities do not follow.
+    The ratio is the regression of ∫v dt on q, both detrended, since slopes of q are noisy. Each segment (N,) is
+    integrated separately, since the velocity in a gap is unknown. The correlation is NaN for joints that hardly move,
+    the ratio also where velocities do not follow the positions.
     """
     position = np.array(q)
     integral = np.empty_like(q)

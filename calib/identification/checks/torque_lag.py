@@ -1,12 +1,12 @@
 """Lag of the recorded torques behind the positions of the same row: common to all joints, or of a single joint.
 
-One model of all joints is fitted at every lag that is tried: bodies shared by the joints, drives of each, and least
-squares weighed by what is left of each joint. Bodies of each joint's own bend after a late torque: they find 148 ms
-where torques are 100 ms late. Friction turns over later than its speed does, as long as joints bend before they slide,
-and would pass for a lag of 20 ms (the Panda's wrist); so sign(v) may come `free_time` earlier and later, at each joint,
-and friction holds no information on the lag: masses and inertias do. The least of the residual is found by a parabola;
-its sigma takes each joint's vote for one draw, and both halves of the recording for two: short ones agree on none. All
-of this and its thresholds are our choice.
+At every lag that is tried, one model of all joints is fitted: bodies shared by the joints, a drive per joint, by least
+squares weighted by each joint's residual. (Separate bodies per joint would adapt to late torques: they give 148 ms
+where torques are 100 ms late.) Friction reverses later than the speed, as joints deflect before they slide, which would
+look like a lag of 20 ms (the Panda's wrist); so sign(v) is also allowed `FREE_TIME` earlier and later at each joint,
+and only masses and inertias give information on the lag. A parabola gives the minimum of the residual. For sigma each
+joint counts as one independent sample; a single joint's lag must agree in both halves of the recording. All of this and
+its thresholds are our choice.
 """
 
 from collections.abc import Sequence
@@ -52,15 +52,17 @@ FREE_TIME = 0.03
 
 @dataclass(frozen=True)
 class Lag:
-    """Lag of the torques behind the positions of the same row [s], and how much its correction reduces the residual.
+    """Lag of the torques behind the positions of the same row [s], and how much correcting it reduces the residual.
 
     Attributes:
-        sigma: standard deviation of `seconds` [s].
-        before, after: rms share of the joints' torques unexplained by bodies and friction: as recorded, shifted.
+        sigma: standard deviation of `seconds` [s]. before, after: rms share of the joints' torques unexplained by
+        bodies and friction, as recorded and after shifting.
         factor: residual as recorded over residual after shifting, each joint weighted by its residual.
         own: (n,) lags of the joints, each estimated separately [s].
-        gains: (n,) residual of a joint at the common lag over that at its separate lag, the others at theirs.
-        joint: the only joint, from 0, whose lag differs, in both halves of the recording; None if no joint does.
+        gains: (n,) residual of a joint at the common lag over that at its separate lag, with all other joints at their
+            separate lags.
+        joint: the only joint, from 0, whose lag differs from the common one in both halves of the recording; None
+            without one.
     """
 
     seconds: float
@@ -84,8 +86,8 @@ def lag_of(samples: MotionSamples, rate: float) -> Lag | None:
     """Return the lag of the torques; None where the motion is too short to estimate it.
 
     Args:
-        samples: of the recording.
-        rate: of its motion [Hz].
+        samples: samples of the recording.
+        rate: sampling rate of its motion [Hz].
     """
     count = len(samples.index)
     if count * float(np.median(np.diff(samples.index))) < MIN_TIME * rate:
@@ -127,7 +129,7 @@ class _LagRows:
     """Rows of a fit of n joints' torques at S lags, and their products by joint, which add up over parts of a motion.
 
     Attributes:
-        columns, torque: (n, m, p) and (n, S, m).
+        columns, torque: (n, m, p) regressor columns and (n, S, m) torques of m rows per joint.
         square, cross, power: (n, p, p), (n, p, S) and (n, S): WᵀW, Wᵀτ and τᵀτ.
     """
 
@@ -191,8 +193,8 @@ class _LagFit:
 
     Attributes:
         rows: columns and torques.
-        weight: (n,) of the joints.
-        spanning: (p, k) from the columns to an orthonormal basis of their space.
+        weight: (n,) weights of the joints.
+        spanning: (p, k) matrix that maps the columns to an orthonormal basis of their space.
         parts: (n, shifts, k) projections of the weighted torques onto the basis.
         power: (n, shifts) squares of the weighted torques.
         common: (shifts,) squared residual where all joints have the same lag.
@@ -218,18 +220,18 @@ class _LagFit:
         return self._unexplained(self.rows.torque[joints, lags], projection)
 
     def _unexplained(self, torque: np.ndarray, parts: np.ndarray) -> np.ndarray:
-        """Return torques (n, m) without their projections (k,), weighted."""
+        """Return weighted torques (n, m) without their projections onto basis, whose coefficients are `parts` (k,)."""
         explained = self.rows.columns @ (self.spanning @ parts)
         return self.weight[:, None] * (torque - explained)
 
     def unexplained_share(self, lags: np.ndarray, spread: np.ndarray) -> float:
-        """Return the rms share of the torques, each in units of its `spread` (n,), that is unexplained at some lags."""
+        """Return the rms share of the torques, in units of their `spread` (n,), that is unexplained at lags (n,)."""
         deviation = self.residual(lags).std(axis=1) / self.weight
         relative = deviation / np.maximum(spread, 1e-12)
         return float(np.sqrt(np.mean(relative**2)))
 
     def along(self, lags: np.ndarray, joint: int) -> np.ndarray:
-        """Return the squared residual of all joints (shifts,) over one joint's lag; the other lags (n,) stay fixed."""
+        """Return the squared residual of all joints (shifts,) over one joint's lag, the other lags (n,) fixed."""
         fixed = np.flatnonzero(np.arange(len(lags)) != joint)
         fixed_part = self.parts[fixed, lags[fixed]].sum(axis=0)
         explained = ((fixed_part + self.parts[joint]) ** 2).sum(axis=1)
@@ -272,7 +274,7 @@ class _LagFit:
 
 
 def _turning(samples: MotionSamples, rate: float) -> list[np.ndarray]:
-    """Return two friction regressors (m, n, n) whose sign changes `FREE_TIME` too early, and too late."""
+    """Return two friction regressors (m, n, n) whose sign changes `FREE_TIME` too early and too late, respectively."""
     times = np.arange(len(samples.velocity))
     regressors = []
     for early in (-FREE_TIME, FREE_TIME):

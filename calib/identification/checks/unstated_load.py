@@ -1,9 +1,9 @@
-"""A payload in one of several recordings that no options state: a free body at the tip of that recording alone.
+"""A payload in one of several recordings that no options state: a free body at the tip in this recording alone.
 
-Recordings of one robot are fitted together by bodies of any masses, each recording with friction and offsets of its
-own, since these change with temperature. Where a body on the last link of one recording explains the torques far
-better than other gains of its torques do, and about as well as masses of their own in every recording do, that
-recording carries something.
+Recordings of one robot are fitted together with common bodies of any masses, and with friction and offsets per
+recording, since these change with temperature. A recording is found to carry a load where a body on its last link
+explains the torques far better than other gains of its torques do, and about as well as separate masses in every
+recording do.
 """
 
 from collections.abc import Mapping, Sequence
@@ -52,9 +52,9 @@ class UnstatedLoad:
     """A load that explains a recording's torques.
 
     Attributes:
-        name: of the recording.
-        mass, sigma: of the load, and its standard deviation [kg, or in proportion to the torques' unit].
-        reach: distance of its centre of mass from the last joint's frame [m].
+        name: name of the recording.
+        mass, sigma: mass of the load and its standard deviation [kg, or in proportion to the torques' unit].
+        reach: distance of the load's centre of mass from the last joint's frame [m].
         before, after: unexplained share of the joints' rms torque without and with the load, geometric means.
     """
 
@@ -67,7 +67,11 @@ class UnstatedLoad:
 
 
 def unstated_load(samples: Mapping[str, MotionSamples]) -> UnstatedLoad | None:
-    """Return the load in one of two or more recordings, by name, that are said to carry the same; None without any."""
+    """Return the load found in one of two or more recordings stated to carry the same; None if there is none.
+
+    Args:
+        samples: name of each recording → its samples.
+    """
     if len(samples) < 2:
         return None
     names = list(samples)
@@ -99,7 +103,7 @@ def unstated_load(samples: Mapping[str, MotionSamples]) -> UnstatedLoad | None:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Residuals (m, n) by recording, bodies' and rotors' values (p,), a load's (10,), and its mass's sigma."""
+    """Residuals (m, n) by recording, values of bodies and rotors (p,) and of a load (10,), and load mass's sigma."""
 
     residuals: list[np.ndarray]
     bodies: np.ndarray
@@ -156,7 +160,7 @@ def _fit(rows: Sequence[np.ndarray], loaded: int | None) -> _Fit:
 
 
 def _scaled(rows: Sequence[np.ndarray], recording: int) -> list[np.ndarray]:
-    """Return the residuals where the joints' torques of one recording are too large by factors, and none is loaded."""
+    """Return the residuals of a fit without load, with the torques of one recording scaled by joint."""
     before = rows[:recording]
     part = rows[recording]
     after = rows[recording + 1 :]
@@ -177,7 +181,7 @@ def _scaled(rows: Sequence[np.ndarray], recording: int) -> list[np.ndarray]:
 
 
 def _inverse(square: np.ndarray) -> np.ndarray:
-    """Return the pseudo-inverse (p, p) of WᵀW, columns scaled to unit norm."""
+    """Return the pseudo-inverse (p, p) of WᵀW, computed with columns scaled to unit norm."""
     size = np.sqrt(np.diag(square))
     scale = np.where(size > 1e-9 * size.max(), size, np.inf)
     scales = np.outer(scale, scale)

@@ -3,7 +3,7 @@
     tau = clip(kp e + kd (share v_r - v_m) + ki ∫ e + ahead),    e = q_r - q_m,
 
 v_m the backward difference of measured positions at the control rate (BIRDy's choice), through a first-order low-pass
-where one is given. A cascade P-PI is the same law with other names. Computed torque puts a model around it:
+where one is given. A cascade P-PI is this law with other gains. Computed torque applies a model to the law's output:
 tau = M(q_m) (a_r + kp e + …) + c(q_m, v_m) + g(q_m) + ahead, so its gains are 1/s² and 1/s.
 """
 
@@ -49,7 +49,7 @@ class Reference:
         return seconds / (len(self.t) - 1)
 
     def sampled(self, ahead: np.ndarray | None) -> np.ndarray:
-        """Return position, velocity, feedforward torque `ahead` (N, n) and acceleration as one array (4, N, n)."""
+        """Return position, velocity, feedforward `ahead` (N, n) and acceleration as one array (4, N, n)."""
         if ahead is None:
             torque = np.zeros_like(self.q)
         else:
@@ -72,7 +72,7 @@ class Reference:
 def pd(
     kp: np.ndarray, kd: np.ndarray, limit: np.ndarray | float = np.inf, ki: np.ndarray | float = 0.0
 ) -> LoopController:
-    """Return a PD (or PID) controller."""
+    """Return a PD (or PID) controller with gains (n,), torque limit (n,) and, for a PID, integral gains ki."""
     share = np.asarray(1.0)
     windup = np.asarray(np.inf)
     return LoopController(kp, kd, np.asarray(ki), share, np.asarray(limit), windup)
@@ -87,13 +87,13 @@ def cascade(
 ) -> LoopController:
     """Return a cascade P-PI: v_c = share v_r + P e, tau = K [(v_c - v) + ∫ (v_c - v) / Ti], as a single law.
 
-    (v_c - v) integrates to share q_r - q + P ∫ e (start aside): with share = 1 that is kp = K (P + 1/Ti), kd = K,
-    ki = K P / Ti. Another share with an integral part is not of this form.
+    Up to its initial value, ∫ (v_c - v) = share q_r - q + P ∫ e. With share = 1 the gains are therefore kp = K (P +
+    1/Ti), kd = K, ki = K P / Ti; another share with an integral part cannot be written in this form.
 
     Args:
-        position: P (n,) [1/s].
-        velocity: K (n,) [N m s/rad].
-        reset: Ti (n,) [s]; infinite for a plain P-P cascade.
+        position: P (n,), gain of the position loop [1/s].
+        velocity: K (n,), gain of the velocity loop [N m s/rad].
+        reset: Ti (n,), reset time [s]; infinite for a plain P-P cascade.
     """
     if share != 1.0 and np.isfinite(reset).any():
         raise CalibError("a cascade with integral action needs the full reference velocity: set share = 1")
@@ -111,8 +111,8 @@ def computed_torque(
     """Return a computed-torque controller with error dynamics ë + 2 ζ ω ė + ω² e = 0 for an exact model.
 
     Args:
-        model: (10 B,) standard parameters; the drives' inertias and friction are those of the plant.
-        frequency: ω [rad/s].
+        model: (10 B,) standard parameters of the controller's model; the drives' inertias and friction are the plant's.
+        frequency: ω of the error dynamics [rad/s].
     """
     kp = np.full(n, frequency**2)
     kd = np.full(n, 2 * damping * frequency)
@@ -162,7 +162,8 @@ class IdentifiedController:
 
     Attributes:
         controller: PD or PID with the identified gains.
-        explained: (n,) share of the low-passed torque by the PID's feedback, 100 (1 - ‖tau - τ̂‖ / ‖tau - mean‖) [%].
+        explained: (n,) share of the low-passed torque that the feedback explains, 100 (1 - ‖tau - τ̂‖ / ‖tau - mean‖)
+            [%].
     """
 
     controller: LoopController
@@ -178,15 +179,15 @@ def identify_controller(
     orders: tuple[int, int] = ORDERS,
     integral: bool = False,
 ) -> IdentifiedController:
-    """Return a PD or PID identified from logged positions and torques and their reference.
+    """Return a PD or PID controller identified from logged positions, torques and their reference.
 
     Args:
-        reference: at any multiple of the log's rate; its first instant is the log's.
+        reference: reference at any multiple of the log's rate; it starts with the log's first sample.
         measured, tau: (N, n) positions and torques as logged.
-        rate: of the log [Hz].
-        band: of the low-pass, and the highest frequency at which the gains are read [Hz].
-        orders: na, nb.
-        integral: whether to look for ki.
+        rate: sampling rate of the log [Hz].
+        band: cut-off of the low-pass, and highest frequency at which the gains are fitted [Hz].
+        orders: na, nb of the ARX model.
+        integral: whether to identify ki, too.
 
     Raises:
         MeasurementError: where reference and log do not fit together, or the error is zero.
@@ -226,7 +227,7 @@ def _error(reference: Reference, measured: np.ndarray, rate: float) -> np.ndarra
 
 
 def _ticks(reference: Reference, rate: float, count: int) -> np.ndarray:
-    """Return the times (count,) of a log's samples in control periods, rounded if they are whole within 0.1 %."""
+    """Return the times (count,) of a log's samples in control periods; if whole within 0.1 %, they are rounded."""
     every = 1.0 / (rate * reference.period)
     if abs(every / max(round(every), 1) - 1.0) < 1e-3:
         every = round(every)

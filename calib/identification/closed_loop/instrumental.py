@@ -2,13 +2,13 @@
 
     simulate with x_k → Z = W(q_s, v_s, a_s), filtered and thinned like W → x_{k+1} = (Zᵀ Ω⁻¹ W)⁻¹ Zᵀ Ω⁻¹ y
 
-(Janot, Vandanjon & Gautier 2014). Same reference, same controller: the simulation feels what the robot was asked to do,
-and not its noise, so Z is uncorrelated with the noise that the feedback brings into W. It starts from a regular robot:
-inertia diag(J), no gravity, no friction. DIDIM (Gautier, Janot & Vandanjon 2013) estimates from the simulated W alone,
-x_{k+1} = W_s⁺ y. A Coulomb sign whose measured speed is noisier than the width of its smoothing is no true column plus
-noise: no instrument helps there, and the simulated sign, which rests on the reference, takes its place in W; or that of
-the measured speed in half the band where the simulation does not follow the motion, as with a wrong controller (our
-choice). Constraints on base parameters, min ½ ‖P_Z (y - W x)‖² in every round, make it PC-IDIM-IV
+(Janot, Vandanjon & Gautier 2014). The simulation has the recording's reference and controller but no noise, so Z is
+uncorrelated with the noise that the feedback brings into W. The iteration starts from a regular robot: inertia diag(J),
+no gravity, no friction. DIDIM (Gautier, Janot & Vandanjon 2013) estimates from the simulated W alone, x_{k+1} = W_s⁺ y.
+Where the noise of the measured speed exceeds the smoothing of a Coulomb sign, the error of this column is not additive
+noise, and instruments do not help: its column of W is replaced by the simulated sign, or, where the simulation does not
+follow the motion (e.g. a wrong controller), by the sign of the measured speed in half the band (our choice).
+Constraints on base parameters, min ½ ‖P_Z (y - W x)‖² in every round, make it PC-IDIM-IV
 (`calib.identification.methods.parameter_constraints`); they do not cure a bias.
 """
 
@@ -64,9 +64,9 @@ class _RoundEstimator:
 
     Attributes:
         name: name in options and files.
-        fit: function of triangles, standard deviations of the groups (g,), and inflation to the estimate.
-        triangle: function of triangles and (g,) std to the minimised [R z; 0 ρ], to which constraints apply.
-        measured: whether the estimate uses the measured motion, W.
+        fit: function of triangles, standard deviations of the groups (g,), and inflation that returns the estimate.
+        triangle: function of triangles and std (g,) that returns the minimised [R z; 0 ρ], to which constraints apply.
+        measured: whether the estimate uses W of the measured motion.
     """
 
     name: str
@@ -97,20 +97,20 @@ class Instrumental:
 
     Attributes:
         fit: the estimate.
-        ordinary: weighted least squares of the same rows, to compare.
-        plant: the simulated robot with the estimate.
+        ordinary: weighted least squares of the same rows, for comparison.
+        plant: the simulated robot, with the estimated parameters.
         rounds: history of the iterations.
         strength: strength of the instruments, their correlation with W.
         verdict: whether least squares is biased (Durbin, Wu, Hausman).
         std, inflation: standard deviation of each torque row (rows,), variance inflation of all rows together.
         distance: (n,) 100 ‖q - q_s‖ / ‖q - mean q‖ [%] of filtered measured and simulated positions: large where the
-            controller is not the robot's.
-        stray: (n,) tracking error of the recorded robot over that of the simulated one: the error factor of the
-            stated gains. NaN where noise hides it.
+            stated controller is not the robot's.
+        stray: (n,) tracking error of the recorded robot over that of the simulated one, the factor by which stated
+            gains are wrong; NaN where it is below the noise.
         constrained: the constrained estimate, if constraints are set; `fit` has its values and covariance.
         problem: triangles of [Z W y], one group per torque row.
         estimator: estimator used in each iteration.
-        rows: by recording, the case whose motion W is of, its rows, and Z.
+        rows: for each recording, the case whose motion W describes, its rows, and Z.
     """
 
     fit: LinearFit
@@ -139,7 +139,7 @@ class Instrumental:
         return self.simulated_error(self.fit.estimate.values)
 
     def simulated_error(self, values: np.ndarray) -> np.ndarray:
-        """Return the relative torque errors (n,) on the simulated motion, of values (p,): 100 ‖y - Z x‖ / ‖y‖ [%]."""
+        """Return the torque errors (n,) of parameters (p,) on the simulated motion: 100 ‖y - Z x‖ / ‖y‖ [%]."""
         with_instruments = np.concatenate([values, np.zeros(len(self.names))])
         return self.problem.data.relative_errors(with_instruments)
 
@@ -181,9 +181,9 @@ class Instrumental:
 
     @property
     def shift(self) -> np.ndarray:
-        """Difference of least squares from this estimate (p,), in standard deviations.
+        """Difference of the least-squares estimate from this estimate (p,), in standard deviations.
 
-        The test finds any bias that the data can detect; this says whether it matters.
+        The test finds any bias that the data can detect; this difference shows whether the bias matters.
         """
         estimate = self.fit.estimate
         difference = np.abs(self.ordinary.estimate.values - estimate.values)
@@ -192,9 +192,9 @@ class Instrumental:
 
     @property
     def apart(self) -> np.ndarray:
-        """Distance of the constrained IV estimate from that by free instruments alone (p,), in σ of the free estimate.
+        """Distance of constrained IV from the estimate with free instruments alone (p,), in σ of the free fit.
 
-        Zero where nothing binds, and for didim; see `instrumental_variables.by_free_instruments`.
+        Zero where no constraint binds, and for didim; see `instrumental_variables.by_free_instruments`.
         """
         constrained = self.constrained
         values = self.fit.estimate.values
@@ -225,23 +225,25 @@ def identify_instrumental(
     """Return the estimate of the base parameters with instruments from simulation.
 
     Args:
-        model: of motor torques, joint torque sensors, or both. With sensors alone no torque tells the motor side: the
-            simulated robot keeps the inertia that it starts with there, and has no friction.
+        model: model of motor torques, joint torque sensors, or both. With sensors alone the motor side is not
+            identified: the simulated robot keeps its initial motor inertia and has no friction.
         base: its base columns.
-        cases: recordings, each with the loop it came from.
+        cases: recordings, each with the loop in which it was made.
         decimator: the parallel filter of W, Z and y.
         method: ``iv`` or ``didim``.
-        inertia: (n,) of the regular robot it starts from [kg m²]; None: kd² / (2 kp), for which the first controller
-            would be damped by 0.7.
+        inertia: (n,) inertia of the regular robot at the start [kg m²]; None: kd² / (2 kp), at which the first
+            recording's controller has a damping of 0.7.
         positive: names of base parameters that must not be negative (PC-IDIM-IV).
-        constraints: on the base parameters that are estimated; None: those of `positive`.
-        terms: richer friction, estimated after the base parameters; loads that it feels are those by least squares.
-        limit: most iterations.
+        constraints: on the base parameters that are estimated; None: only those of `positive`.
+        terms: richer friction, estimated after the base parameters; the loads that it depends on are computed by least
+            squares.
+        limit: largest number of iterations.
 
     Raises:
         Unidentifiable: where the instruments do not identify the parameters separately.
-        NotConverged: with the last `LinearFit`, after `limit` iterations; `Diverged` where they led away.
-        CannotSimulate: where the loop is unstable with the robot it starts from, or with an estimate and all near it.
+        NotConverged: with the last `LinearFit`, after `limit` iterations; `Diverged` where the iterations diverged.
+        CannotSimulate: where the loop is unstable with the initial robot, or with an estimate and all smaller steps to
+            it.
     """
     one_of(method, ROUNDS, "method", UsageError)
     rows = model.torque_rows
@@ -312,7 +314,7 @@ def _observed_with_friction(
     decimator: Decimator,
     terms: Sequence[DriveTerm],
 ) -> tuple[list[ObservationRows], _Friction]:
-    """Return the rows of all cases, and their richer friction, whose loads are those by least squares without it."""
+    """Return the rows of all cases and the richer friction, whose loads come from least squares without it."""
     observed = []
     for case, _ in cases:
         rows = observe(model, base.kept, case, decimator)
@@ -361,7 +363,7 @@ class _Fixed:
     friction: _Friction
 
     def after(self, estimate: _Found) -> _Fixed:
-        """Return the settings of the next iteration, which starts from the postures whose constraints are binding."""
+        """Return the settings of the next iteration, whose constraints start with the postures that are binding now."""
         if self.constraints is None or estimate.bound is None:
             return self
         constraints = replace(self.constraints, likely=estimate.bound.tight)
@@ -411,7 +413,7 @@ def _with_signs(
     """Return the rows with columns of Coulomb signs replaced where velocity noise exceeds their smoothing.
 
     Args:
-        simulated: (M, rows, p) of `moved`, the case as it was simulated.
+        simulated: (M, rows, p) columns of `simulated_case`, the case with its simulated motion.
     """
     signs = _drowned_signs(task.model, columns, case)
     drowned = np.append(signs, np.zeros(len(task.friction.terms), dtype=bool))
@@ -435,7 +437,7 @@ def _with_signs(
 
 
 def sign_noise(model: Any, motion: Motion) -> np.ndarray:
-    """Return the velocity noise of all joints that drive terms of a model act on, passive ones included."""
+    """Return the velocity noise (n,) of all joints on which a model's drive terms act, passive joints included."""
     noise = motion.velocity_noise()
     if hasattr(model, "joint_noise"):
         return model.joint_noise(noise)
@@ -467,7 +469,7 @@ def _result(
     std: np.ndarray,
     runs: Runs,
 ) -> Instrumental:
-    """Return the result of the last iteration: σ with the variance inflation of its residuals, and the tests."""
+    """Return the result after the last iteration: σ with the variance inflation of its residuals, and the tests."""
     if task.estimator.measured:
         problem = estimate.problem
     else:
@@ -506,7 +508,8 @@ def _simulate_new(
 ) -> tuple[_Fixed, _Found, Plant, Runs, int]:
     """Return the simulations with the new parameters or, if these fail, with smaller steps from the old ones.
 
-    Then those on the way to them (our choice). A controller holds no robot of next to no inertia.
+    Where M(q) is on its bound, that bound is raised first (our choice): a sampled controller cannot hold a robot with
+    almost no inertia.
     """
     retreats = 0
     while True:
@@ -535,7 +538,7 @@ def _simulate_new(
 
 
 def _if_weak(task: _Fixed, estimate: _Found, std: np.ndarray) -> str:
-    """Return what weak instruments add to the message of a failure; "" for strong ones."""
+    """Return a text on weak instruments to append to the message of a failure; "" for strong instruments."""
     if not task.estimator.measured:
         return ""
     strength = instrumental_variables.strength(estimate.problem, std)
@@ -546,7 +549,7 @@ def _if_weak(task: _Fixed, estimate: _Found, std: np.ndarray) -> str:
 
 
 def _stack(observed: Sequence[ObservationRows], simulated: Sequence[np.ndarray], measured: bool = True) -> Instruments:
-    """Return the R factors of [Z W y], one group per torque row; without `measured`, those of [Z 0 y] (cheaper)."""
+    """Return the R factors of [Z W y], one group per torque row; without `measured`, of [Z 0 y], which is cheaper."""
     first = observed[0]
     count = observed[0].target.shape[1]
     problem = instrumental_variables.unseen(first.names, first.units, count)

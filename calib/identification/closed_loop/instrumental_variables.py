@@ -1,11 +1,11 @@
 """Instrumental variables: consistent estimates although the noise of y reaches W through the robot's feedback.
 
-The instruments Z (r, p), one per column, are the observation matrix of a noise-free simulation. All that IV needs is in
-the R factor of [Z W y], so that the triangles of `triangles` serve here too:
+The instruments Z (r, p), one per column, are the observation matrix of a noise-free simulation. The R factor of [Z W y]
+contains all that IV needs, so that it is computed as in `triangles`:
 
     [Z W y] = Q [Rz A b; 0 B c; 0 0 ρ],    Zᵀ W = Rzᵀ A,    P_Z W = Q1 A,
 
-the IV estimate solves A x = b, the residual of W on Z is Q2 B, and nothing is squared.
+the IV estimate solves A x = b, the residual of W on Z is Q2 B, and no products such as ZᵀW are formed.
 """
 
 from collections.abc import Sequence
@@ -38,12 +38,13 @@ class InstrumentStrength:
     """Strength of instruments: how well they explain the columns of W.
 
     Attributes:
-        names: p columns of W.
-        correlations: (p,) canonical correlations between Z and W, falling; 1 where Z spans W, 0 where the rank fails.
-        partial_r2: (p,) share of each column, cleaned of the others, that Z explains (Shea 1997).
-        cragg_donald: F of the weakest combination, (r - p) λ² / (1 - λ²) / p with λ the least correlation; above 10 the
-            usual approximations hold (Staiger & Stock 1997).
-        condition: condition number of Zᵀ W, columns of Z and W of unit norm.
+        names: names of the p columns of W.
+        correlations: (p,) canonical correlations between Z and W, descending; 1 where Z spans W, 0 where ZᵀW is
+            singular.
+        partial_r2: (p,) share of each column, after regression on the others, that Z explains (Shea 1997).
+        cragg_donald: F statistic of the weakest combination of columns, (r - p) λ² / (1 - λ²) / p with λ the least
+            correlation; above 10 the usual approximations hold (Staiger & Stock 1997).
+        condition: condition number of Zᵀ W, with columns of Z and W scaled to unit norm.
     """
 
     names: tuple[str, ...]
@@ -75,12 +76,12 @@ class Instruments:
     def testable(self, fit: LinearFit, std: np.ndarray | None = None) -> Triangles:
         """Return one group's R factor [A b; 0 ‖ρ‖] with the IV estimate and its covariance as least-squares solution.
 
-        ρ = y - W x_IV, whitened. With it tests of nested models are those of two-stage least squares (Wooldridge 2010,
-        section 5.2.3): differences of ‖P_Z (y - W x)‖² against the variance of ρ.
+        ρ = y - W x_IV, whitened. Tests of nested models on this factor are those of two-stage least squares (Wooldridge
+        2010, section 5.2.3): differences of ‖P_Z (y - W x)‖² against the variance of ρ.
 
         Args:
-            std: as in `iv`.
             fit: the result of `iv`.
+            std: as in `iv`.
         """
         p = len(self.names)
         sigma = np.ones(self.data.groups) if std is None else std
@@ -109,7 +110,7 @@ def instrument(
         matrix: W (r, p).
         target: y (r,).
         group: as in `triangles.absorb`.
-        names, units: of W's columns.
+        names, units: names and units of the columns of W; None: as in `triangles.collect`.
         before: earlier rows of the same problem.
     """
     shape = (None, None)
@@ -135,13 +136,14 @@ def unseen(names: Sequence[str], units: Sequence[str], groups: int) -> Instrumen
 def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> LinearFit:
     """Estimate x = (Zᵀ Ω⁻¹ W)⁻¹ Zᵀ Ω⁻¹ y, covariance σ² (ZᵀΩ⁻¹W)⁻¹ (ZᵀΩ⁻¹Z) (WᵀΩ⁻¹Z)⁻¹, Ω = diag(σ_g² I).
 
-    Janot, Vandanjon & Gautier (2014) write the covariance (ZᵀΩ⁻¹Z)⁻¹, which is the same where Z is W without its noise
-    and too small where the simulation misses. σ² is estimated, so `std` matters up to a factor. As many instruments as
-    columns: two-stage least squares is the same estimate.
+    Janot, Vandanjon & Gautier (2014) write the covariance (ZᵀΩ⁻¹Z)⁻¹, which is equal where Z is W without its noise,
+    and too small where the simulation deviates. σ² is estimated, so a common factor of `std` has no effect. As there
+    are as many instruments as columns, two-stage least squares gives the same estimate.
 
     Args:
         problem: triangles of [Z W y].
-        std: (g,) of the groups; None: equal. Those of the weighted least squares of W are the usual choice.
+        std: (g,) standard deviations of the groups; None: equal. Those of the weighted least squares of W are the usual
+            choice.
         inflation: >= 1, see `linear`; one number for all groups.
 
     Raises:
@@ -172,8 +174,8 @@ def settled(before: LinearFit, after: LinearFit, change: float = 0.025, residual
     """Return whether the outer loop (simulate, estimate) has converged in parameters and residual.
 
     |Δx_j| < change · |x_j| for every parameter and |Δ‖ρ‖| < residual · ‖ρ‖ (Janot, Vandanjon & Gautier 2014; both
-    usually 1 … 5 %). A parameter that moves by less than a fifth of its standard deviation rests as well (our choice:
-    one near zero never meets a relative rule).
+    usually 1 … 5 %). A parameter that changes by less than a fifth of its standard deviation has converged, too (our
+    choice: one near zero never satisfies a relative criterion).
     """
     parameter_change = np.abs(after.estimate.values - before.estimate.values)
     by_value = change * np.abs(before.estimate.values)
@@ -214,14 +216,14 @@ def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentS
 def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> ExogeneityTest:
     """Return the test that W is uncorrelated with the noise (Durbin, Wu, Hausman), by augmented regression and QR.
 
-    With V = W - P_Z W the part of the columns that the instruments do not explain, y = W x + V δ + e; the claim is
+    With V = W - P_Z W the part of the columns that the instruments do not explain, y = W x + V δ + e; the hypothesis is
     δ = 0, F = [(RSS0 - RSS1) / k] / [RSS1 / (r - p - k)] (Janot, Vandanjon & Gautier 2016, after Hausman 1978). Only
-    the k independent columns of V count. It takes valid instruments for granted: look at `strength` first.
+    the k independent columns of V count. The test assumes valid instruments: check `strength` first.
 
     Args:
         problem: triangles of [Z W y].
-        std: as in `iv`; unlike groups tested with equal weights give false alarms.
-        inflation: >= 1; autocorrelated residuals without it give false alarms.
+        std: as in `iv`; groups of different noise with equal weights give false alarms.
+        inflation: variance inflation >= 1; at 1, autocorrelated residuals give false alarms.
     """
     p = len(problem.names)
     rows = problem.data.rows.sum() / inflation
@@ -254,8 +256,7 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
 def projected(problem: Instruments, std: np.ndarray | None = None) -> np.ndarray:
     """Return the R factor (p + 1, p + 1) of min ‖P_Z (y - W x)‖, two-stage least squares; its solution is `iv`.
 
-    Constraints enter IV through it: `constrained.minimise` with Q = Wᵀ P_Z W, which is positive definite, and not with
-    Zᵀ W, which need not be.
+    Constrained IV minimises with this factor: Q = Wᵀ P_Z W is positive definite, while Zᵀ W need not be.
     """
     return _projected(combine(problem.data, std), problem.names)
 
@@ -263,18 +264,18 @@ def projected(problem: Instruments, std: np.ndarray | None = None) -> np.ndarray
 def by_free_instruments(
     problem: Instruments, std: np.ndarray, constrained: np.ndarray, normals: np.ndarray
 ) -> np.ndarray:
-    """Return x (p,) with A x = A `held` from the instruments of what A leaves free alone, Z_Uᵀ Ω⁻¹ (y - W x) = 0.
+    """Return x (p,) with A x = A `constrained`, by the instruments Z_U of the free directions: Z_Uᵀ Ω⁻¹ (y - W x) = 0.
 
     Janot's slides on the TX40 state the criterion ½ ‖P_Z (y - W x)‖² (`projected`), in which all instruments count, but
-    print for bounds x_C = d the relation x_U = x_U^IV + (Z_UᵀW_U)⁻¹ Z_UᵀW_C (x_C^IV - d), which is this one. Both are
-    consistent where the constraint is true. On a simulated TX40 they are at most 0.011 σ apart (`examples/tx40`), in
-    planted problems with weak instruments 0.24 σ, and 2.4 σ where the bound is wrong by 6 σ: there this one errs less
-    (`tests/identification/closed_loop/test_instruments.py`).
+    print for bounds x_C = d the relation x_U = x_U^IV + (Z_UᵀW_U)⁻¹ Z_UᵀW_C (x_C^IV - d), which is the one computed
+    here. Both are consistent where the constraint is true. On a simulated TX40 they are at most 0.011 σ apart
+    (`examples/tx40`), in planted problems with weak instruments 0.24 σ, and 2.4 σ where the bound is wrong by 6 σ:
+    there the estimate by free instruments errs less (`tests/identification/closed_loop/test_instruments.py`).
 
     Args:
         std: as in `iv`.
-        held: (p,) a point that satisfies the constraints.
-        normals: A (k, p).
+        constrained: (p,) a point that satisfies the constraints.
+        normals: A (k, p), normals of the constraints.
     """
     p = len(problem.names)
     factor = combine(problem.data, std)
@@ -288,7 +289,7 @@ def by_free_instruments(
 
 
 def _projected(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Return the R factor of P_Z [W y]; refuse Z and Zᵀ W without full rank."""
+    """Return the R factor of P_Z [W y]; Z and Zᵀ W must have full rank."""
     p = len(names)
     size = np.linalg.norm(factor[:p, :p], axis=0)
     normalised = factor[:p, :p] / np.where(size > 0.0, size, 1.0)

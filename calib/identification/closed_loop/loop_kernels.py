@@ -1,23 +1,23 @@
-"""Compiled closed loop (numba): a tree of rigid bodies with drives under a sampled controller, RK4 in between.
+"""Compiled closed loop (numba): a tree of rigid bodies with drives under a sampled controller, integrated by RK4.
 
 Forward dynamics all in the base's frame, about its origin: velocities, forces and composite inertias then add up along
 the tree without a transformation, which takes half the operations of body-fixed recursions (`calib.dynamics.kernels`;
-tests hold one against the other). With S_i = [u_i; s_i] the twist of body i per unit rate,
+tests compare both). With S_i = [u_i; s_i] the twist of body i per unit rate,
 
     V_i = V_p + S_i v,   A_i = A_p + V_i × S_i v,   f_i = I_i A_i + V_i ×* I_i V_i,
     bias_c = Σ S_i · Σ_below f,   M_cd = Σ S_j · (Σ_below I) S_i      (Walker & Orin 1982; Featherstone 2008).
 
-Few arrays with many columns, and functions joined into their callers, because numba counts references to every array it
-passes on: half of the time otherwise. B bodies, n joints, T acts of friction that is not linear:
+Few arrays with many columns, and functions joined into their callers, because numba's reference counting of arrays
+passed between functions would take half of the time. For B bodies, n joints and T nonlinear friction terms ("acts"):
 
     tree    (B, 3) whole numbers: parent (B for the base), kind, coordinate
     body    (B + 1, 23): placement (rotation by rows, origin) with each joint about or along z, ten standard parameters
             in such a frame, scale; row B, columns 0 to 2: the base's acceleration against gravity
-    linear  (n, 2 n + 1): added inertia, viscous friction, offset
-    kinds   (T, 2) torque row and code; acts (T, 8 + n): amount, up to seven settings, weights of the joints' motions
-    memory  (T, 2) of friction that depends on the past: state of the stop operator, and where it was there
-    loads   (n,) torques that the gears transmit, of the last call, where friction depends on them
-    work    (B + 1, 46): pose, velocity 12, acceleration 18, twist 24, force 30, inertia about the origin 36 …
+    linear  (n, 2 n + 1): added inertia, viscous friction, offset kinds   (T, 2) torque row and code; acts (T, 8 + n):
+    amount, up to seven settings, weights of the joints' motions memory  (T, 2) of friction that depends on the past:
+    state of the stop operator, and the position at which it had this state loads   (n,) torques that the gears
+    transmitted at the last call, where friction depends on them work    (B + 1, 46): pose, velocity 12, acceleration
+    18, twist 24, force 30, inertia about the origin 36 …
 """
 
 from math import cos, sin, sqrt
@@ -43,7 +43,7 @@ def twist_cross(w, v, u, s):
 
 @njit(**JOINED)
 def inertia_of(work, i):
-    """Return the inertia of body i and of what it carries: about the base's origin, first moments, mass."""
+    """Return the inertia of body i with all bodies it carries: inertia about the base's origin, first moments, mass."""
     J = work[i, 36], work[i, 37], work[i, 38], work[i, 39], work[i, 40], work[i, 41]
     return J, three(work, i, 42), work[i, 45]
 
@@ -203,7 +203,7 @@ def seen(acts, t, motion):
 
 @njit(**JOINED)
 def _stop(memory, t, place, width):
-    """Return the stop operator's state at a position, from its last state and position."""
+    """Return the stop operator's state at position `place`, from its last state and position in `memory`."""
     return min(1.0, max(-1.0, memory[t, 0] + (place - memory[t, 1]) / width))
 
 
@@ -211,7 +211,7 @@ def _stop(memory, t, place, width):
 def act(code, acts, t, memory, q, v):
     """Return friction term t's torque per unit parameter and its derivatives with respect to position and velocity.
 
-    Load dependence is ignored: values of `calib.dynamics.shape_kernels.shape` at the term's arguments.
+    Load dependence is ignored. The values are those of `calib.dynamics.shape_kernels.shape` at the term's arguments.
     """
     place = seen(acts, t, q)
     state = _stop(memory, t, place, acts[t, 1]) if code in (STOP, PRESLIDING) else 0.0
@@ -220,7 +220,7 @@ def act(code, acts, t, memory, q, v):
 
 @njit(**JOINED)
 def _friction(linear, kinds, acts, memory, q, v, out):
-    """Subtract friction and offsets from out (n,), without load-dependent terms; return whether these exist."""
+    """Subtract friction and offsets from out (n,), except load-dependent terms; return whether there are such terms."""
     n, loaded = v.shape[0], False
     for j in range(n):
         total = linear[j, 2 * n]
@@ -242,8 +242,8 @@ def _friction(linear, kinds, acts, memory, q, v, out):
 def _under_load(linear, kinds, acts, memory, q, v, tau, matrix, loads, out):
     """Replace the accelerations out (n,) by those with load-dependent friction.
 
-    load = torque left after friction - added inertia · a, and friction hangs on the load: repeated until both agree,
-    which they do where the coefficients are below one. M is factorised. False: they do not.
+    load = torque after friction - added inertia · a, while friction depends on the load: iterated until both agree, as
+    they do for coefficients below one. M is factorised. Returns False where the iteration does not converge.
     """
     n = out.shape[0]
     plain, extra, change = out.copy(), np.zeros(n), np.empty(n)
@@ -279,8 +279,8 @@ def stiffness(kinds, acts, loads, v, matrix, unit):
     """Return a bound [1/s] on the fastest decay rate that smoothed signs cause near standstill; M is factorised.
 
     The trace of M⁻¹ D, D the steepest slopes of the signs in reach (not the local ones: a step that enters the band
-    must not overshoot it): never below the largest eigenvalue. Springs of friction with memory count by four times
-    their natural frequency, so that no step is longer than half a radian of it.
+    must not overshoot it): it is never below the largest eigenvalue. Springs of friction with memory count by four
+    times their natural frequency, so that no step is longer than half a radian of it.
     """
     total, springs, n = 0.0, 0.0, unit.shape[0]
     for t in range(kinds.shape[0]):
@@ -337,8 +337,8 @@ def _remember(kinds, acts, q, memory):
 def set_parameters(values, order, entries, shares, owners, body, linear, acts):
     """Write parameters (p,) into the arrays body, linear and acts (friction terms); keep all other entries.
 
-    order (B, 10): the standard parameter behind each of a body; entries (E, 3): row and column of `linear`, parameter;
-    shares (E,): their weights; owners (T,): the parameter of each act.
+    order (B, 10): index of the standard parameter for each entry of a body; entries (E, 3): row and column of `linear`,
+    and index of the parameter; shares (E,): weights of these entries; owners (T,): index of the parameter of each act.
     """
     for i in range(order.shape[0]):
         for k in range(10):
@@ -354,7 +354,7 @@ def set_parameters(values, order, entries, shares, owners, body, linear, acts):
 def forward_dynamics(tree, body, linear, kinds, acts, order, entries, shares, owners, values, q, v, tau, out):
     """Write accelerations to out (N, n); return the first sample with an inertia not positive definite, or -1.
 
-    values (N, p): parameters of each sample; (0, p): those that body, linear and acts hold.
+    values (N, p): parameters of each sample; with shape (0, p), those in body, linear and acts are used.
     """
     n, count = q.shape[1], kinds.shape[0]
     work, matrix = np.empty((tree.shape[0] + 1, 46)), np.empty((n, n))
@@ -372,9 +372,10 @@ def forward_dynamics(tree, body, linear, kinds, acts, order, entries, shares, ow
 def _advance(tree, body, linear, kinds, acts, memory, loads, q, v, tau, period, slopes, work, matrix, at, rate):
     """Advance q, v (n,) by one control period under constant torques (classical Runge-Kutta method).
 
-    In as many steps as friction near standstill asks for. On the negative axis the form's stability function
-    1 + z + z²/2 + z³/6 + z⁴/24 is positive wherever it is stable: the velocity creeps into the band of the smoothed
-    sign and does not change sides from step to step, which would be chatter; abs(z) <= 2 here. slopes[0] is known.
+    The number of steps follows from the stiffness of friction near standstill. On the negative axis the form's
+    stability function 1 + z + z²/2 + z³/6 + z⁴/24 is positive wherever it is stable: the velocity creeps into the band
+    of the smoothed sign and does not change sides from step to step, which would be chatter; abs(z) <= 2 here.
+    slopes[0] is known.
     """
     n = q.shape[0]
     pieces = int(0.5 * period * stiffness(kinds, acts, loads, v, matrix, at)) + 1
@@ -411,8 +412,8 @@ def _advance_midpoint(
 ):
     """Advance q, v (n,) by one short period with the midpoint rule, at half the cost of `_advance`.
 
-    In steps of at most `MIDPOINT_STEP` reciprocals of friction's fastest decay: the rule's 1 + z + z²/2 has no zero, so
-    that the velocity does not change its sign, and is 0.625 there.
+    Steps are at most `MIDPOINT_STEP` reciprocals of friction's fastest decay: the rule's stability function 1 + z +
+    z²/2 has no zero, so that the velocity does not change its sign; at this step it is 0.625.
     """
     n = q.shape[0]
     pieces = int(period * stiffness(kinds, acts, loads, v, matrix, at) / MIDPOINT_STEP) + 1
@@ -467,7 +468,7 @@ def advance_points(tree, body, linear, kinds, acts, order, entries, shares, owne
 
 @njit(**OPTIONS)
 def command(gains, aim, speed, seen, rate, integral, period, wish):
-    """Write the feedback command (n,) from reference and measurement; rows of `gains` as in `closed_loop`."""
+    """Write feedback command (n,) into `wish`, from reference and measurement; rows of `gains` as in `closed_loop`."""
     for j in range(wish.shape[0]):
         error = aim[j] - seen[j]
         integral[j] = min(max(integral[j] + period * error, -gains[5, j]), gains[5, j])
@@ -521,9 +522,9 @@ def closed_loop(
 
     gains (6, n): kp, kd, ki, share of the reference's velocity, torque limit, limit of the integral. reference
     (4, N, n): position, velocity, torque ahead, acceleration ahead (for the controller's `model`, with 0 rows for
-    none). encoder, push (N, n) or (0, n): noise of the measured position, torque no model knows.
+    none). encoder, push (N, n) or (0, n): noise of the measured position, unmodelled torque.
     q, v (n,): the state, overwritten. `out` (5, M, n): true q, v, a, measured q, torque applied, every `every` periods,
-    of which a part is integrated by itself: sample m is at period m · every, whole or not.
+    which need not be an integer: sample m is at m · every periods, for which part of a period is integrated.
     """
     count, n = reference.shape[1], q.shape[0]
     work, matrix, slopes = np.empty((tree.shape[0] + 1, 46)), np.empty((n, n)), np.zeros((4, n))

@@ -1,8 +1,8 @@
 """Closed loops of recordings: reference and controller of every part without gaps, ready for simulation.
 
-A stretch is a part of a recording without gaps. The simulation runs along the whole of it and is compared some way
-inside: the filters' ends (2 / f_q), and `settling_time` for the simulated robot to forget that it started on the
-reference. Its motion then takes the place of the recorded one: the same instants, the same low-pass.
+The simulation runs along a whole part and is compared without the ends of the filters (2 / f_q), and without
+`settling_time`, in which the effect of the simulated robot's start on the reference decays. The simulated motion is
+taken at the recorded instants, with the recording's low-pass.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,9 +37,9 @@ class Loop:
     """The closed loop in which a recording was made.
 
     Attributes:
-        controller: stated, identified from the log (`calib.identification.closed_loop.controllers`) or guessed: a
-            third of the true bandwidth suffices.
-        reference: at the controller's rate, in the recording's time, over its whole duration.
+        controller: controller as stated, identified from the log (`calib.identification.closed_loop.controllers`) or
+            guessed (a third of the true bandwidth suffices).
+        reference: reference at the controller's rate, over the whole duration of the recording, in its time.
         every: control periods per recorded sample, not necessarily an integer.
         design: (n,) inertia for which the gains are stated [kg m²]; the simulated robot then gets gains times
             J(x_k) / design, so that its bandwidth is constant (Gautier & Janot). None: gains as stated.
@@ -57,7 +57,7 @@ class ClosedLoops:
 
     Attributes:
         pairs: each part and its loop.
-        controller: of all parts.
+        controller: controller of all parts.
         identified: result of identifying the controller from the logs; None where it was stated.
         notes: remarks for the user.
     """
@@ -74,13 +74,13 @@ def close_loops(
     """Return the closed control loops of recordings whose motions contain `q_ref`.
 
     Args:
-        model: of the robot, simulable (`plant_of`).
-        decimator: of the rows; stretches that it eats up are left out.
-        cad: standard parameters by the robot's description, for a feed-forward of kind ``cad``; None: not known.
+        model: model of the robot, which can be simulated (`plant_of`).
+        decimator: filter of the rows; parts too short for it are left out.
+        cad: standard parameters from the robot's description, for feedforward of kind ``cad``; None: not known.
 
     Raises:
         MeasurementError: where a recording has no reference, or one that cannot be its own.
-        UsageError: for a rate that does not go with the recording's, or gains of another number of joints.
+        UsageError: for a control rate that does not fit the recording's, or gains of another number of joints.
     """
     for case in cases:
         _check_reference(case.motion)
@@ -129,7 +129,7 @@ def take(case: Case, part: slice) -> Case:
 
 
 def _check_reference(motion: Motion) -> None:
-    """Raise an error for a motion whose reference is missing, of another motion, or in degrees."""
+    """Raise an error if a motion's reference is missing, belongs to another motion, or is in degrees."""
     if motion.q_ref is None:
         refuse_data(
             motion.file,
@@ -152,9 +152,9 @@ def _check_reference(motion: Motion) -> None:
 
 
 def _compare(motion: Motion, reference: np.ndarray, joint: int, max_difference: float = 0.3) -> None:
-    """Raise an error for a joint that does not follow its reference `asked` (N,), naming a likely unit error.
+    """Raise an error if a joint does not follow its `reference` (N,), naming a likely unit error.
 
-    `max_difference`: largest deviation, over a joint's motion, from its own reference (our choice).
+    `max_difference`: largest deviation from the reference, relative to the joint's motion (our choice).
     """
     q = motion.q[:, joint]
     spread = np.std(q)
@@ -185,13 +185,13 @@ def _compare(motion: Motion, reference: np.ndarray, joint: int, max_difference: 
 
 
 def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., LoopController]) -> tuple[float, tuple[str, ...]]:
-    """Return by how much later than stated the reference of a recording was played [s], and notes.
+    """Return the time [s] by which the reference of a recording was played later than stated, and notes.
 
-    A stated time is kept, and refused where the torques contradict it.
+    A stated time is used as it is, or refused where the torques contradict it.
 
     Raises:
-        MeasurementError: for a reference that is late or early by the motors' torques.
-        UsageError: for a designed motion without motor torques to time it by.
+        MeasurementError: for a reference that is late or early according to the motors' torques.
+        UsageError: for a designed motion without motor torques, from which its time is estimated.
     """
     motion = part.motion
     estimated = part.motion.located is not None or loop.timing == "estimated"
@@ -236,14 +236,13 @@ def _make_reference(
 ) -> tuple[Reference, float]:
     """Return the reference of a motion without gaps, resampled at the control rate, and the control periods per sample.
 
-    It is moved to later by `shift` [s].
-
-    The logged positions are low-passed at `cutoff_factor` f_q and joined by a cubic spline, whose slopes are v and a.
+    The reference is delayed by `shift` [s]. The logged positions are low-passed at `cutoff_factor` f_q and joined by a
+    cubic spline, whose slopes are v and a.
 
     Raises:
         UsageError: where the control rate is below the motion's.
 
-    `cutoff_factor`: times f_q: low-pass of the logged reference, against the rounding of its digits (our choice).
+    `cutoff_factor`: cut-off of the low-pass over f_q; it removes the rounding of the logged reference (our choice).
     """
     every = periods_per_sample(motion, rate)
     cutoff = min(cutoff_factor * float(motion.cutoff.max()), USABLE * motion.rate / 2)
@@ -257,7 +256,7 @@ def _make_reference(
 
 
 def periods_per_sample(motion: Motion, rate: float | None = None) -> float:
-    """Return the control periods per sample, not always an integer; without `rate`, the controller's is >= `min_rate`.
+    """Return the control periods per sample, not always an integer; `rate` None: the controller's is >= `min_rate`.
 
     Raises:
         UsageError: where the control rate is below the motion's.
@@ -282,7 +281,7 @@ def periods_per_sample(motion: Motion, rate: float | None = None) -> float:
 def _inside(motion: Motion, settling_time: float = 0.2) -> slice:
     """Return the slice of samples that are compared: without settling time and filter borders.
 
-    `settling_time`: [s] our choice.
+    `settling_time`: time until the simulated robot's start no longer matters [s] (our choice).
     """
     edge = max(border(motion.rate, float(motion.cutoff.min())), 4)
     settling_samples = int(np.ceil(settling_time * motion.rate))
@@ -369,8 +368,8 @@ def _fed_forward(
 def simulated_case(case: Case, run: SimulatedRun, loop: Loop) -> Case:
     """Return the case with the simulated motion at the recorded times, filtered like the recorded motion.
 
-    The same low-pass and differences: what they do to a motion (they round off reversals) is in W and in Z alike, and
-    what tells W from Z is noise.
+    With the same low-pass and differences their effect on a motion (they round off reversals) is equal in W and Z,
+    which then differ by noise only.
     """
     samples = simulated_samples(case, run.t, loop)
     q, v, a = followed(run.q, case.motion, samples)
@@ -382,8 +381,8 @@ def followed(q: np.ndarray, motion: Motion, index: np.ndarray) -> tuple[np.ndarr
     """Return q, v, a (M, n, ...) of simulated positions, or of their derivatives, filtered like the recorded motion.
 
     Args:
-        q: (N, n, ...) of the whole simulation.
-        index: (M,) samples to return.
+        q: (N, n, ...) positions of the whole simulation, or their derivatives.
+        index: (M,) indices of the samples to return.
     """
     positions = low_passed(q, motion, motion.cutoff)
     less = low_passed(q, motion, motion.velocity_cutoff)
@@ -393,7 +392,7 @@ def followed(q: np.ndarray, motion: Motion, index: np.ndarray) -> tuple[np.ndarr
 
 
 def simulated_samples(case: Case, t: np.ndarray, loop: Loop) -> np.ndarray:
-    """Return the indices of the simulated samples, at times `t` [s], at the times of a case."""
+    """Return for each sample of a case the index of the simulated sample at its time; `t`: simulated times [s]."""
     step = loop.reference.period * loop.every
     since = case.motion.t - loop.reference.t[0]
     index = np.rint(since / step).astype(int)
@@ -410,7 +409,7 @@ def low_passed(q: np.ndarray, motion: Motion, cutoff: np.ndarray | None = None) 
     """Return simulated positions (N, n), or their derivatives (N, n, ...), low-passed like the recorded positions.
 
     Args:
-        cutoff: (n,) of another of its filters [Hz].
+        cutoff: (n,) cut-off of another filter of the motion [Hz]; None: that of the positions.
     """
     result = np.empty_like(q)
     cutoffs = motion.cutoff if cutoff is None else cutoff

@@ -33,7 +33,7 @@ class LoopEstimate(MethodEstimate):
     instrumental: Instrumental | None = None
 
     def testable(self) -> tuple[Triangles, np.ndarray, np.ndarray]:
-        """Return R factors on which least squares gives this estimate, with std and inflation (g,), for tests."""
+        """Return R factors whose least-squares solution is this estimate, with std and inflation (g,), for tests."""
         identification = self.instrumental
         if identification is None:
             return super().testable()
@@ -57,8 +57,8 @@ class _Simulated(Method):
     """A method that simulates the closed loop.
 
     Attributes:
-        instruments: its use of the simulated motion, see `calib.identification.closed_loop.instrumental.ROUNDS`;
-            "": by the loop's settings.
+        instruments: how the method uses the simulated motion, see
+            `calib.identification.closed_loop.instrumental.ROUNDS`; "": according to the loop's settings.
     """
 
     needs_controller: bool = field(default=True, kw_only=True)
@@ -175,7 +175,7 @@ class LoopTest:
     """Result of instrumental variables from simulation.
 
     Attributes:
-        found: their estimate of the standard model, with the test of least squares; None if they failed.
+        found: IV estimate of the standard model, with the test of least squares; None if IV failed.
         loops: the simulated closed loops.
         failure: reason for a missing estimate.
     """
@@ -185,7 +185,7 @@ class LoopTest:
     failure: str = ""
 
     def findings(self, is_estimate: bool) -> list[Finding]:
-        """Return the findings for a user of this estimate, or (`taken` False) of a least-squares one."""
+        """Return the findings for a user of the IV estimate (`is_estimate`), or of a least-squares estimate."""
         if self.found is None or self.loops is None:
             return [finding("loop-test-failed", why=self.failure)]
         causes = _distance(self.found) or _gains(self.found) or _torques(self.found)
@@ -196,7 +196,7 @@ class LoopTest:
 def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopTest:
     """Return the result of instrumental variables for an estimate whose closed loop is described in the options.
 
-    An estimate that came from them is the comparison itself; beside another method's, their failure is reported.
+    An IV estimate is returned as its own comparison; for another method's estimate, a failure of IV is reported.
     """
     loop_estimate = None
     if isinstance(estimate, LoopEstimate) and estimate.instrumental is not None:
@@ -292,9 +292,9 @@ def disagreement(problem: IdentificationProblem, estimate: MethodEstimate, test:
     """Return the disagreement of an output-error estimate with the recorded torques; None if both agree.
 
     Args:
-        problem: of both.
-        found: the estimate.
-        test: result of instruments; least squares replaces it if absent.
+        problem: the problem that both estimates solve.
+        estimate: the output-error estimate.
+        test: result of instrumental variables; least squares is compared if it has no estimate.
     """
     if not (estimate.found and estimate.alone and isinstance(estimate, LoopEstimate)):
         return None
@@ -396,7 +396,7 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
 
 
 def _table(identification: Instrumental) -> tuple[tuple[object, ...], ...]:
-    """Return the rows of both estimates of the standard model, one for each parameter."""
+    """Return table rows with both estimates of the standard model, one row per parameter."""
     estimate = identification.fit.estimate
     ordinary = identification.ordinary.estimate.values
     explained = 100.0 * identification.strength.partial_r2

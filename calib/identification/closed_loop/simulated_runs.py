@@ -1,6 +1,6 @@
-"""Simulated runs of recordings' closed loops: of a regular robot to start from, of robots between two estimates.
+"""Simulated runs of recordings' closed loops: of the regular robot at the start, and of robots between two estimates.
 
-How far a run stays from the recorded motion says what the simulation is worth.
+The distance of a run from the recorded motion shows how reliable the simulation is.
 """
 
 from __future__ import annotations
@@ -61,10 +61,10 @@ def between(start: Plant, end: Plant, share: float) -> Plant:
 
 
 def nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tuple[Plant, Runs]:
-    """Return the plant halfway from `start` to `end`, or nearer where that cannot be simulated, and its runs.
+    """Return the plant halfway from `start` to `end`, or nearer to `start` if it cannot be simulated, and its runs.
 
     Raises:
-        CannotSimulate: where none near `start` can.
+        CannotSimulate: where no plant near `start` can be simulated.
     """
     problem: CalibError | None = None
     for halvings in range(1, MAX_RETREATS + 1):

@@ -3,14 +3,12 @@
     (M(q) + Ia) a + c(q, v) + g(q) + Fv v + Fc tanh(v / v0) + off = tau + push,    tau held for one control period,
 
 integrated by the classical Runge-Kutta form at the controller's rate, in more steps where the smoothed sign of Coulomb
-friction is stiff (`kernels`): no chatter at rest, and no other model than the one that is identified. At every instant
-that is recorded the equation holds to rounding for the true q, v, a and the torque.
+friction is stiff (`kernels`): there is no chatter at rest, and the simulated model is the identified one. At every
+recorded instant the equation holds to rounding for the true q, v, a and the torque.
 
-`tracking_error` says what a model is good for: how far a robot strays from its reference when the model's torques are
-fed forward.
-
-A second judgement beside the computed-torque test, which by itself is "not a direct answer" about tracking (Kolyubin,
-Shiriaev & Jubien 2019, section 7): an error of torque that the feedback swallows costs nothing here.
+`tracking_error` judges a model by a robot's deviation from its reference when the model's torques are fed forward. This
+complements the computed-torque test, which by itself is "not a direct answer" about tracking (Kolyubin, Shiriaev &
+Jubien 2019, section 7): a torque error that the feedback compensates has no effect here.
 """
 
 from __future__ import annotations
@@ -54,8 +52,8 @@ class Plant:
 
     Attributes:
         bodies: rigid bodies of the robot.
-        terms: drive terms of the robot; signs have a smoothing above zero.
-        parameters: (10 B + k,) standard parameters of the bodies, then one value per term. object values that give a
+        terms: drive terms of the robot; Coulomb signs must have a smoothing above zero.
+        parameters: (10 B + k,) standard parameters of the bodies, then one value per term. All values that give a
             positive definite inertia are valid, also base parameters with zeros for the others.
     """
 
@@ -82,7 +80,7 @@ class Plant:
         return replace(self, parameters=parameters)
 
     def carrying(self, carried: Collection[str]) -> Plant:
-        """Return the robot model with these payloads alone."""
+        """Return the robot model with only the payloads of these labels."""
         carried_columns = IdentificationModel(self.bodies).carried_columns(carried)
         factors = np.append(carried_columns, np.ones(len(self.terms)))
         return self.with_parameters(self.parameters * factors)
@@ -112,11 +110,12 @@ class Sensing:
 
     Attributes:
         sigma_q: (n,) white noise of every measured position [rad or m]; the controller acts on it.
-        q_band: cut-off of the first-order low-pass that colours it, σ kept [Hz]; None: white.
+        q_band: cut-off of the first-order low-pass that colours the position noise at unchanged σ [Hz]; None: white.
         quantum: (n,) resolution of the encoders [rad or m]; 0 for none.
-        sigma_tau: (n,) white noise of the recorded torque [N m or N]; it does not act.
-        push: (n,) torque that acts but is not recorded: ripple, cables, all unmodelled effects [N m or N].
-        push_band: cut-off of the first-order low-pass that colours it, σ kept [Hz]; None: white.
+        sigma_tau: (n,) white noise of the recorded torque [N m or N]; it does not act on the joints.
+        push: (n,) standard deviation of a torque that acts but is not recorded: ripple, cables, other effects [N m or
+            N].
+        push_band: cut-off of the first-order low-pass that colours `push` at unchanged σ [Hz]; None: white.
         every: control periods per recorded sample, not necessarily an integer (5 kHz and 140 Hz: 35.7).
     """
 
@@ -162,10 +161,10 @@ def simulate(
     """Return the simulated motion of a robot that follows a reference.
 
     Args:
-        reference: sampled at the controller's rate, which is taken from it.
-        seed: of all noise; the same seed gives the same run to the last bit.
+        reference: reference sampled at the controller's rate, which it thereby defines.
+        seed: seed of all noise; the same seed gives the same run to the last bit.
         start: q, v (n,) at the first instant; None: on the reference.
-        push: (N, n) torque that acts besides, at the reference's instants [N m or N]; None for none.
+        push: (N, n) additional torque at the reference's instants [N m or N]; None: none.
 
     Raises:
         CalibError: where the inertia is not positive definite, or friction too stiff for the rate.
@@ -235,7 +234,7 @@ def simulate(
 
 
 def sample_ticks(count: int, every: float) -> np.ndarray:
-    """Return the control periods at which samples are recorded during `count` periods, not necessarily integers."""
+    """Return the times of recorded samples during `count` control periods, in periods, not necessarily integers."""
     return np.arange(int((count - 1) / every + 1e-9) + 1) * every
 
 
@@ -244,10 +243,10 @@ def forward_dynamics(
 ) -> np.ndarray:
     """Return the accelerations (N, n) under drive torques (N, n), with friction and motor inertia.
 
-    Friction that depends on the past is taken at rest.
+    Friction with hysteresis is taken as unstressed.
 
     Args:
-        parameters: (N, p) of each sample; None: the plant's.
+        parameters: (N, p) parameters of each sample; None: the plant's.
 
     Raises:
         CalibError: where the inertia is not positive definite.
@@ -354,7 +353,7 @@ def body_rows(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
 def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int, ramp: float = 0.1) -> tuple[np.ndarray, list]:
     """Return the linear terms (n, 2 n + 1), and the friction terms: row, code, amount, seven settings, weights (n,).
 
-    `ramp`: of its dead zone: over so much speed a dead-zone sign is smoothed, since no jump can be integrated.
+    `ramp`: width of the smoothing of a dead-zone sign, relative to its dead zone (a jump cannot be integrated).
     """
     from calib.dynamics import shape_kernels
 
@@ -383,7 +382,7 @@ def _drives(terms: Sequence[DriveTerm], values: np.ndarray, n: int, ramp: float 
 
 
 def failure(status: int, time: float, where: str | None = None) -> NotConverged:
-    """Return the error for a failure status at `time` [s], or at `where`."""
+    """Return the error for a failure status of the kernels at `time` [s], or at the place described by `where`."""
     from calib.identification.closed_loop import loop_kernels
 
     location = f"at {time:.4g} s " if where is None else where
@@ -421,16 +420,16 @@ def tracking_error(
     """Return the rms of q - q_r (n,) [rad or m] of a robot without noise, at the controller's instants.
 
     Args:
-        robot: what moves; on a real arm the best model there is stands for it.
-        ahead: (N, n) feedforward torques, of `feed_forward`; None: those of the controller.
-        push: (N, n) torques that act besides; None for none.
+        robot: the robot that moves; for a real arm, its best available model.
+        ahead: (N, n) feedforward torques, e.g. from `feed_forward`; None: those of the controller.
+        push: (N, n) additional torques; None: none.
     """
     run = simulate(robot, controller if ahead is None else controller.with_feedforward(ahead), reference, push=push)
     return np.sqrt(np.mean((run.q - reference.q) ** 2, axis=0))
 
 
 def plant_of(model: Any, values: np.ndarray, terms: Sequence[DriveTerm] = ()) -> Any:
-    """Return the robot of a model with its values and those of further terms: of an arm, or the model's own `plant`."""
+    """Return simulable robot of a model with parameter values and further terms (an arm's, or the model's `plant`)."""
     if isinstance(model, IdentificationModel):
         return Plant(model.bodies, (*model.columns, *terms), values)
     return model.plant(values, terms)

@@ -2,9 +2,9 @@
 
     y_j(t) = C_j(q_ref(t - δ) - q(t)) + c_j,    min over δ of Σ_j ‖y_j - C_j - c_j‖² / σ_j²    (our choice)
 
-C is the control law with its gains, delays and feedforward. Gauss and Newton's steps begin where positions match best,
-which is later than the reference by the tracking lag. No model of the robot takes part: friction or masses that are
-not known move nothing, wrong gains do. A reference that follows the measured positions to their last digit is a copy.
+C is the control law with its gains, delays and feedforward. Gauss–Newton steps start at the shift at which positions
+match best, which is too late by the tracking lag. No model of the robot is used: unknown friction or masses have no
+influence, wrong gains do. A reference that follows the measured positions to their last digit is a copy.
 """
 
 from dataclasses import dataclass
@@ -30,9 +30,9 @@ class ReferenceShift:
     """Shift of a reference in time.
 
     Attributes:
-        seconds: by which the reference comes later than stated; sigma: standard deviation [s].
-        left, before: share of the torque that the controller does not explain, with this shift and without; of torques
-            along the reference's own motion.
+        seconds, sigma: time by which the reference is later than stated, and its standard deviation [s]. left, before:
+        share of the torque that the controller does not explain, with this shift and without it; only the part of the
+        torque correlated with the reference's motion counts.
         effect: change of the reference's torque by one sigma, as a share of the torque.
     """
 
@@ -46,13 +46,14 @@ class ReferenceShift:
 def reference_shift(
     case: Case, reference: Reference, every: float, controller: LoopController, band: float
 ) -> ReferenceShift:
-    """Return by how much later than stated the reference of a recording's part without gaps was played.
+    """Return the time by which the reference of a gap-free part of a recording was played later than stated.
 
     Args:
-        case: with motor torques.
-        reference: at the controller's rate, from the part's first sample on; `every`: control periods per sample.
-        controller: that followed it.
-        band: low-pass of torques and positions [Hz].
+        case: the part, with motor torques.
+        reference: reference at the controller's rate, from the part's first sample on.
+        every: control periods per sample.
+        controller: the controller that followed it.
+        band: cut-off of the low-pass of torques and positions [Hz].
 
     Raises:
         NotConverged: where no shift within `MAX_SHIFT` explains the torques best.
@@ -136,8 +137,8 @@ class _Law:
     def left(self, shift: float) -> tuple[float, float]:
         """Return the shares of the torques that the law does not explain, with the shift and without.
 
-        Of torques and residuals counts what goes with the reference, shifted or not, and its derivatives, joint by
-        joint: noise of positions, which goes through the law, hides no delay (our choice).
+        Only the parts of torques and residuals that are correlated with the reference (shifted or not) and its
+        derivatives count, joint by joint, so that position noise in the law cannot hide a delay (our choice).
         """
         times = self.t[self.rows]
         derivatives = []
@@ -181,7 +182,7 @@ def _by_positions(reference: CubicSpline, measured: CubicSpline, t: np.ndarray) 
 
 
 def motor_torques(case: Case) -> np.ndarray | None:
-    """Return the motors' torques (N, n) of a case [N m or N]; None where its rows or recording do not hold them."""
+    """Return the motors' torques (N, n) of a case [N m or N]; None where its rows or recording do not contain them."""
     if case.torque_rows.with_motors:
         return case.target[:, -case.motion.n :]
     projected = case.torque_rows.projection is not None and case.motion.kind == "torque"
@@ -193,13 +194,14 @@ def motor_torques(case: Case) -> np.ndarray | None:
 def check_no_copy(motion: Motion, reference_q: np.ndarray) -> None:
     """Refuse a reference that is the measured motion itself, perhaps shifted in time, rounded or low-passed.
 
-    Where the motion has died away the positions hold noise alone: a reference that holds it, too, comes from them.
+    After the motion has ended, measured positions contain only noise: a reference that contains this noise, too, is a
+    copy.
 
     Args:
         reference_q: the reference (N, n), filtered like the measured positions.
 
     Raises:
-        MeasurementError: naming the shift.
+        MeasurementError: for a copy, naming the shift.
     """
     moves = np.ptp(motion.q, axis=0) > 1e-3
     t = np.arange(len(motion)) / motion.rate
@@ -235,9 +237,9 @@ def check_no_copy(motion: Motion, reference_q: np.ndarray) -> None:
 
 
 def _noise_shares(motion: Motion, measured: np.ndarray, residual: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Return the noise's power in `rest` over that in the `measured` positions (N, k), of joints with noise alone.
+    """Return the noise power in `residual` over that in the `measured` positions (N, k), for `joints` with noise alone.
 
-    In the lowest octave in which the positions' spectrum is at the floor of their noise, below f_q.
+    Both are taken in the lowest octave below f_q in which the positions' spectrum is at its noise floor.
     """
     # slow to load
     from scipy.signal import welch

@@ -2,16 +2,15 @@
 
     standard → + coupling → + the steps of `calib.dynamics.shapes.STEPS` in their order → + ripple
 
-Every step is tried on top of those taken: all joints get its terms, every time block is predicted by a fit to the
-others, and the terms stay at the joints whose error on unseen time falls by `MIN_GAIN`, and does not grow where one
-half of the time predicts the other: neighbouring blocks judge what holds between them, not what holds elsewhere. Terms
-of a step have a ridge per joint, chosen by evidence, so that a rich step (ripple) may offer more than the data can
-tell.
+Every step is tested in addition to the accepted ones: all joints get its terms, every time block is predicted by a fit
+to the other blocks, and the terms are kept at joints whose error on held-out time falls by `MIN_GAIN` and does not grow
+when one half of the time predicts the other (neighbouring blocks alone do not test extrapolation). Terms of a step have
+a ridge per joint, chosen by evidence, so that a rich step (ripple) may have more terms than the data identify.
 
-A coupling is a gear whose motor turns with two joints; it is offered for pairs of joints of which most of what the
-standard model leaves is explained by the other's motion, where the motion tells it apart from the standard model.
-Cables are offered where sensors see them behind the gears, apart from friction; by name, anywhere. A term is judged by
-the rows that it acts on, each in units of its own residuals.
+A coupling is a gear whose motor turns with two joints; it is a candidate for pairs of joints where the other joint's
+motion explains most of the standard model's residual, and is distinguishable from the standard model. Cables are
+candidates where sensors behind the gears separate them from friction; if named, always. A term is judged by the rows
+that it acts on, each in units of its residuals' standard deviation.
 """
 
 from __future__ import annotations
@@ -64,10 +63,10 @@ class FrictionTrial:
     """Result of one tested step of the friction selection.
 
     Attributes:
-        model: e.g. ``standard`` or ``+ load``.
+        model: name of the step, e.g. ``standard`` or ``+ load``.
         parameters: number of parameters of the model, all joints.
         cross_validated_percent: relative error on held-out time, over all rows [%].
-        joints_percent: the same for each row [%].
+        joints_percent: relative error on held-out time of each row [%].
         kept_at_joints: joints, from 1, at which the step is kept.
         note: remark on the step, as text.
         terms: names of the terms that are kept.
@@ -92,8 +91,8 @@ class FrictionSelection:
     """Result of forward selection: the selected terms, their ridge groups, and the tested steps.
 
     Attributes:
-        off: names of terms that the final fit's ridges set to zero; their rows of ``covariance.csv`` state the ridges'
-            floor, so that the model's other σ are those without them.
+        off: names of terms that the final fit's ridges set to zero; their rows of ``covariance.csv`` contain the
+            smallest ridge, so that all other σ are those of a model without these terms.
     """
 
     terms: tuple[DriveTerm, ...]
@@ -133,7 +132,7 @@ class FrictionCandidates:
 
     Attributes:
         cases: training recordings.
-        rows: their rows in the base columns and standard drive terms, blocks numbered.
+        rows: rows of these recordings in the base columns and standard drive terms, with time blocks numbered.
         loads: torques transmitted by the gears of each case (N, n), from a first fit.
         decimator: filter of the rows.
         std, inflation: (rows,) standard deviation and variance inflation of the first fit's residuals.
@@ -169,10 +168,10 @@ def select_friction(
     """Return the friction terms that reduce the error on held-out time, or all terms of a named step.
 
     Args:
-        candidates: the rows, and what the terms depend on.
+        candidates: the rows, and the data that terms depend on.
         friction: ``auto``; ``standard`` (or ``ripple``, found later by `calib.identification.friction.ripple`): none;
             a step's name: that step at all joints, nothing else.
-        progress: called with a few words at each step.
+        progress: called with a short text at each step; None: not called.
     """
     say = progress or (lambda message: None)
     one_of(friction, NAMES, "friction", UsageError)
@@ -226,8 +225,8 @@ class _Bench:
     """Test of friction terms by cross-validation; the columns of all candidate terms follow the base columns.
 
     Attributes:
-        candidates: the rows, and what the terms depend on.
-        validation: of the base columns and all terms.
+        candidates: the rows, and the data that terms depend on.
+        validation: cross-validation of the base columns and all terms.
         terms: all candidate terms.
         forced: whether terms are kept without a test.
     """
@@ -307,7 +306,7 @@ class _Bench:
         return rows
 
     def _whitened(self, squares: np.ndarray, rows: list[int]) -> np.ndarray:
-        """Return the squared errors (k,) of some rows together, each in units of its residuals."""
+        """Return the squared errors (k,) summed over some rows, each in units of its residuals' variance."""
         relative = squares[:, rows] / self.validation.std[rows] ** 2
         return np.sum(relative, axis=1)
 
@@ -446,7 +445,7 @@ def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
 
 
 def _sampled(candidates: FrictionCandidates) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
-    """Return about `COUPLING_ROWS` rows, weighed, (M, n, b) and (M, n), their weights, and q, v, a (n, M)."""
+    """Return about `COUPLING_ROWS` weighted rows (M, n, b) and (M, n), their weights, and q, v, a (n, M)."""
     matrices = []
     targets = []
     weights = []

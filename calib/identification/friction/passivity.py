@@ -20,7 +20,7 @@ SPEEDS_PER_DIRECTION = 8
 def _dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
     """Return the energy dissipated by each joint's friction, ∫ v_j τ_friction,j dt, as a share of ∫ |v_j τ_j| dt, (n,).
 
-    Joints that do not move have zero: noise moves none.
+    Joints at rest have zero; noise does not count as motion.
     """
     model = dynamics.model
     n = model.n
@@ -48,11 +48,12 @@ def _dissipated(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
 def braking(terms: Sequence[DriveTerm | None], fastest: np.ndarray) -> np.ndarray:
     """Return the rows A (c, p) of A x >= 0: friction of the p columns dissipates and motor inertia is positive.
 
-    With and without load separately: the load's share grows without end. Beyond the recorded speeds friction is linear
-    (`calib.dynamics.shapes`) but for Stribeck's peak, which fades: ten times the fastest stands for all.
+    Friction dissipates both without load and at unlimited load. Beyond the recorded speeds friction is linear
+    (`calib.dynamics.shapes`) except for Stribeck's peak, which decays: ten times the fastest speed represents all
+    higher ones.
 
     Args:
-        terms: (p,) behind the columns; None for parameters of bodies.
+        terms: (p,) drive term of each column; None for parameters of bodies.
         fastest: (n,) largest recorded speeds [rad/s or m/s].
     """
     p = len(terms)
@@ -93,7 +94,7 @@ def driven(dynamics: Dynamics, cases: Sequence[Case]) -> tuple[int, ...]:
     """Return the joints, from 0, whose friction adds energy: their torques are reversed, or belong to another joint.
 
     Raises:
-        MeasurementError: where these are most of the joints that move.
+        MeasurementError: where the friction of most of the moving joints adds energy.
     """
     share = _dissipated(dynamics, cases)
     joints = np.flatnonzero(share < MIN_ENERGY_SHARE)

@@ -2,22 +2,23 @@
 
     tau_j += Σ_i Σ_k Σ_m g_m(k v_i) (s_ikm sin k q_i + c_ikm cos k q_i),
 
-g_m hat functions of the ripple's frequency k v / 2π, one set per direction: the structure answers it as an oscillator,
-with a gain and a phase that depend on that frequency (our choice). Not only a joint's own gear is felt: on the Panda,
-gear 1 explains more of joint 3's ripple than joint 3's own does. Beyond the positions it was learnt at, it fades.
+g_m hat functions of the ripple's frequency k v / 2π, one set per direction: the structure responds as an oscillator,
+with a gain and a phase that depend on this frequency (our choice). A joint's torque may contain ripple of other gears:
+on the Panda, gear 1 explains more of joint 3's ripple than gear 3 does. The ripple model decays to zero beyond the
+positions of the training data.
 
 Orders come in families: a gear of N motor turns per turn shows at N, a harmonic drive (whose wave has two lobes) above
 all at 2 N against the flexspline and at 2 N + 2 against the output, and at twice those. A motion of three radians
-hardly distinguishes orders two apart, and single ones that fit one place do not carry over to another: on the Panda,
-with the same search, free orders explain less of unseen motion than the family does. So a gear's N is found first,
-joints of similar gears sharing it; free orders are offered where no family pays. What repeats shows in how far the
-residual's waves agree in phase between blocks of time:
+hardly distinguishes orders two apart, and single orders fitted at some positions do not extrapolate to others: on the
+Panda, with the same search, free orders explain less of held-out motion than the family does. So a gear's N is found
+first, in common for similar gears; free orders are tested where no family reduces the error. Whether a wave repeats
+follows from the coherence of the residual's phase between time blocks:
 
     S(k) = Σ_b (|Σ_c F_bc(k)|² - Σ_c |F_bc(k)|²) / N_b,    F_bc(k) = Σ residual · exp(-i k q)
 
 over speed bins b and time blocks c, for all whole orders at once by FFT over the position (our choice: neither noise
-nor a single loud moment has a part in it). How strongly the columns are regularised towards zero, how finely frequency
-is told apart, and whether an order stays at all, time blocks that are left out decide.
+nor a single short disturbance contributes). Held-out time blocks decide how strongly the columns are regularised
+towards zero, how finely frequency is resolved, and whether an order is kept.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -93,7 +94,7 @@ class Ripple:
     """The ripple in one joint's torque.
 
     Attributes:
-        joint: from 0.
+        joint: index of the joint, from 0.
         waves: for each wave, the joint whose gear causes it, and the order per turn.
         terms, values: (k,) drive terms and their parameters.
         share: explained part of the fast residual's power on held-out blocks.
@@ -127,7 +128,7 @@ def find_all(cases: Sequence[Case], residuals: Sequence[np.ndarray]) -> list[Rip
     """Return the ripples in all joints' torques.
 
     Args:
-        residuals: per case (N, n), torque not explained at the full rate; what is slow in it is taken off here.
+        residuals: per case (N, n), unexplained torque at the full rate; its slow part is removed here.
     """
     step = max(1, sum(len(case.motion) for case in cases) // MAX_SAMPLES)
     case_blocks = []
@@ -166,7 +167,7 @@ def find_turns(track: GearTravel, residuals: np.ndarray) -> dict[int, int]:
     """Return joint → motor turns per gear turn for joints that move enough, from the most coherent orders.
 
     Args:
-        residuals: (N, n) fast parts.
+        residuals: (N, n) fast parts of the unexplained torques.
     """
     scores: dict[int, np.ndarray] = {}
     total = np.zeros(len(TURNS))
@@ -195,10 +196,10 @@ def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int
     """Return the ripple in a joint's torque; None if held-out time blocks do not confirm it.
 
     Args:
-        joint: from 0.
+        joint: index of the joint, from 0.
         track: positions of the gears.
         residual: (N,) torque not explained, without its slow part, at the samples of `track`.
-        turns: as of `find_turns`.
+        turns: result of `find_turns`.
     """
     if not residual.any():
         return None
@@ -233,7 +234,7 @@ def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int
 
 
 def _family(turns: int) -> tuple[tuple[int, ...], ...]:
-    """Return the orders per turn of a gear with so many motor turns per turn, in sets tested together."""
+    """Return the orders per turn of a gear with `turns` motor turns per turn, in sets that are tested together."""
     twice, four_times = 2 * turns, 4 * turns
     sets = ((twice, twice + 2), (turns,), (3 * turns,), (four_times, four_times + 2, four_times + 4))
     return tuple(orders for orders in sets if orders[-1] <= MAX_ORDER)
@@ -267,7 +268,7 @@ def _terms(
 class _WaveCrossValidation:
     """A joint's residual and its candidate columns, to test the share that they explain on held-out blocks.
 
-    Columns of a wave are made once.
+    Columns of a wave are computed once.
     """
 
     def __init__(self, track: GearTravel, residual: np.ndarray) -> None:
@@ -367,8 +368,8 @@ def _climb(
     """Return the waves of a forward selection by held-out blocks, their explained share, and the ridge.
 
     Args:
-        validation: of the joint's residual.
-        candidates: function of the remaining residual (N,) to sets of waves.
+        validation: cross-validation of the joint's residual.
+        candidates: function of the remaining residual (N,) that returns sets of waves.
         min_gain: explained share of the residual's power that each set adds, at least.
         max_sets: number of sets, at most.
     """

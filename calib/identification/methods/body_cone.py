@@ -1,11 +1,11 @@
-"""Base parameters of physically consistent bodies: those of standard parameters with pseudo-inertias P_i >= 0.
+"""Base parameters of physically consistent bodies, i.e. of standard parameters with pseudo-inertias P_i >= 0.
 
-    { β : β = T χ,  P_i(χ) ⪰ 0,  drives' terms >= 0 }       what the motion does not identify of χ is free
+    { β : β = T χ,  P_i(χ) ⪰ 0,  drives' terms >= 0 }       unidentified parts of χ are free
 
-(Sousa & Cortesão 2014, with the pseudo-inertia of Wensing, Kim & Slotine 2018). Where the data want to leave that
-convex cone, the optimum on it is found as a semidefinite program (Clarabel), and the cone is replaced by the
-plane that touches it there, νᵀ β >= νᵀ β*: the same optimum, with one multiplier, and a covariance that takes the plane
-as an equality (our choice; the cone is bent beyond it).
+(Sousa & Cortesão 2014, with the pseudo-inertia of Wensing, Kim & Slotine 2018). Where the unconstrained optimum is
+outside this convex cone, the optimum on the cone is found by a semidefinite program (Clarabel), and the cone is
+replaced by its tangent plane at the optimum, νᵀ β >= νᵀ β*. This gives the same optimum with one multiplier, and a
+covariance that treats the plane as an equality (our choice; the cone is curved).
 """
 
 from dataclasses import dataclass

@@ -27,8 +27,8 @@ class Definite:
 
     Attributes:
         matrices: A (K, n, n, p), symmetric.
-        least: above zero.
-        likely: indices of those that bound the optimum of a problem much like this one, to begin with.
+        least: lower bound of the eigenvalues, above zero.
+        likely: indices of matrices that were binding in a similar problem; the search starts with them.
     """
 
     matrices: np.ndarray
@@ -82,7 +82,7 @@ def contradicting(matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> t
 def restricted(covariance: np.ndarray, factor: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Return the covariance of an estimate under A b = d, P C Pᵀ with P = I - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ A, Q = RᵀR.
 
-    C may be any covariance of the free estimate, that of correlated residuals too.
+    C may be any covariance of the free estimate, also one for correlated residuals.
 
     Args:
         covariance: C (p, p).
@@ -120,7 +120,7 @@ class Constrained:
         values: (p,) b.
         multipliers: (c,) μ of the constraints, >= 0 but for equalities.
         slack: (c,) distances to the bounds, and smallest eigenvalues minus their limit.
-        binding: (c,) bool; active constraints, a symptom of a constraint too tight or of a biased estimate.
+        binding: (c,) bool, whether a constraint is active, which indicates a too tight constraint or a biased estimate.
         normals: (c, p) slopes of the slack at the optimum; of a matrix that binds <A, Z> / trace Z, Z its multiplier.
     """
 
@@ -143,7 +143,7 @@ def within(
         factor: (p + 1, p + 1) triangle [R z; 0 ρ], R of full rank.
         matrix: A (c, p); the identity for bounds on single parameters.
         lower, upper: (c,), -inf and inf allowed.
-        matrices: that must be positive definite; None: none.
+        matrices: matrices that must be positive definite; None: none.
 
     Raises:
         CalibError: for crossed bounds, and for equalities that contradict each other or fix all parameters.
@@ -244,7 +244,8 @@ class _Planes:
     def bounded(self) -> Constrained:
         """Return the optimum under the inequalities, exact on the binding ones.
 
-        As the solver has it where that is degenerate: a multiplier would change its sign, or another be violated.
+        Where this is degenerate (a multiplier would change its sign, or another inequality be violated), the solver's
+        solution is returned as it is.
         """
         c = self.count
         p = len(self.free)
@@ -262,8 +263,8 @@ class _Planes:
     def definite(self, matrices: Definite) -> Constrained:
         """Return the optimum under inequalities and matrices by cone programs.
 
-        Of many matrices few bind: those most indefinite enter, until all others are definite; what does not bind may
-        go, since the least misfit rises from one set to the next and none comes back (our choice).
+        Few of many matrices are binding: the most indefinite ones are added until all others are definite. Matrices
+        that are not binding are removed; since the misfit rises from set to set, no set recurs (our choice).
         """
         c = self.count
         rows = self.scaled

@@ -1,12 +1,12 @@
-"""Constraints h(β) >= 0 that bend: a function of a user's own, twice differentiable, of parameters by name.
+"""Curved constraints h(β) >= 0: twice differentiable functions of parameters by name, stated by the user.
 
     min ½ ‖R β - z‖²    under    h_i(β) >= 0    and all other constraints
 
 by sequential quadratic programs (Wilson 1963; with slack at a price, so that each has a solution: Fletcher 1985). Each
 takes h by its tangent planes at the last β, Jacobian A, and adds the positive part of -Σ μ_i ∇²h_i to RᵀR, as Janot's
-slides on the TX40 ask for (there AᵀA stands for it). At the optimum the planes replace h: the same optimum, with one
-multiplier each, and a covariance that takes those that bind as equalities (our choice; h bends beyond them). Where h is
-not concave the set is not convex: the optimum is the nearest of its kind, not always the least.
+slides on the TX40 ask for (there AᵀA stands for it). At the optimum the planes replace h: they give the same optimum,
+with one multiplier each, and a covariance that treats the binding ones as equalities (our choice; h is curved). Where h
+is not concave the feasible set is not convex: the optimum is a local one.
 """
 
 import ast
@@ -40,9 +40,9 @@ class Curved:
     """A constraint h(u) >= 0 on k parameters u = rows β.
 
     Attributes:
-        name: for users.
+        name: name of the constraint in messages.
         arguments: names of the parameters.
-        rows: (k, p).
+        rows: (k, p) matrix of u = rows β.
         h, slope: function of u (k,), and its derivatives (k,).
         stated: whether the slope is the user's: it is compared with differences of h wherever it is used.
     """

@@ -169,8 +169,8 @@ def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray, inflation:
 class _ConstrainedLeastSquares(Method):
     """A method that solves the rows directly, under constraints: physically consistent least squares.
 
-    Weights are those that come from the residuals of the free estimate; only IRLS weighs by those of the constrained
-    one, as there a sample's weight hangs on it.
+    Weights are computed from the residuals of the free estimate; only IRLS uses the residuals of the constrained one,
+    on which its weights of samples depend.
 
     Attributes:
         free: the method without constraints.

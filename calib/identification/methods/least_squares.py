@@ -104,9 +104,9 @@ def _regularised(
 def _settled(problem: IdentificationProblem, prior: Prior) -> tuple[LinearFit, np.ndarray, np.ndarray, np.ndarray]:
     """Return the fit with a prior, the prior's rows (k, p), and its residuals' std and inflation (rows,).
 
-    The prior counts `Prior.tempering` times more for the values than for their covariance; drives' inertia is positive
-    and friction brakes, which the covariance does not know. Not so the friction of a joint that the data say it drives:
-    that says that something is wrong, and is to be seen.
+    The prior counts `Prior.tempering` times more for the values than for their covariance; drives' inertia is
+    constrained to be positive and friction to be dissipative, which the covariance ignores. At joints whose data
+    contradict dissipative friction it is not constrained, so that the error in the data remains visible.
     """
     pooled = problem.pooled
     base_count = problem.base.b

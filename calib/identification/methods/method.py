@@ -52,8 +52,8 @@ class IdentificationProblem:
     """The data and settings of an estimation.
 
     Attributes:
-        model: linear in its parameters, with standard friction.
-        base: its base columns.
+        model: model with standard friction.
+        base: base columns of the model.
         cases: recordings with their motion at the full rate.
         decimator: the parallel filter of all rows.
         rows: observation matrix and torques of each case; p columns, base columns first, then richer friction.
@@ -116,14 +116,14 @@ class MethodEstimate:
         inflation: (rows,) variance inflation: number of rows that count as one, from the residuals' autocorrelation.
         weighted: whether the rows were weighted with `std` (all but OLS).
         beforehand: (k, p) rows L that a prior and ridges add to the whitened ones; None without these.
-        iterations: of simulation and estimation; 1 for a method that does not iterate.
+        iterations: number of iterations; 1 for a method that does not iterate.
         simulations: number of closed-loop simulations.
         seconds: computing time.
         failure: reason for a missing solution, and advice.
         held: the constraints and which of them bind, for a method with constraints.
         alone: whether only values and covariance describe it, because least squares of `pooled` differs.
-        instruments: of a method with instruments, by recording: the case whose motion W is of, its rows, and Z as
-            `ObservationRows.matrix`; () for the others.
+        instruments: for a method with instruments, by recording: the case whose motion W describes, its rows, and Z in
+            the form of `ObservationRows.matrix`; () for other methods.
     """
 
     method: str
@@ -201,7 +201,7 @@ def _equivalent_triangle(estimate: Estimate) -> Triangles:
 class Method(ABC):
     """A method that returns an estimate for a problem.
 
-    The steps around a method (prior, richer friction, stated noise, elimination) ask it what it accepts.
+    The flags determine which steps around a method (prior, richer friction, stated noise, elimination) are made.
 
     Attributes:
         name: name in options and files.
@@ -239,7 +239,7 @@ class Method(ABC):
         """Return the estimate of the problem's p columns, or a status with the reason of failure."""
 
     def takes(self, rows: TorqueRows) -> bool:
-        """Return whether it estimates from these torque rows; who simulates a motion needs the bodies in them."""
+        """Return whether the method accepts these torque rows; methods that simulate need the bodies in them."""
         simulable = rows.has_bodies and rows != POWER
         return rows.motors_alone or (self.takes_models and (simulable or not self.needs_simulation))
 

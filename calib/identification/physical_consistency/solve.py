@@ -121,8 +121,8 @@ class PossibleBodies(Frozen):
         weight: weight γ of the prior.
         doubt: factor of the data's sigmas, above 1 where no physically consistent robot is within them.
         margins: (B,) consistency margin of each body [m], see `pseudo_inertia.margin`.
-        distance: of these parameters from the data's optimum, in standard deviations (Mahalanobis).
-        nearest: the same for the nearest consistent robot; 0 where the estimate itself is consistent.
+        distance: distance of these parameters from the data's optimum, in standard deviations (Mahalanobis).
+        nearest: distance of the nearest consistent robot; 0 where the estimate itself is consistent.
         allowed: 95 % limit of that distance for a correct model: √χ²(b).
         blamed: labels of the bodies or names of the drive terms that cost most of `nearest`, worst first, and the
             distance without the constraint on each; empty where it is within `allowed`.
@@ -416,9 +416,11 @@ class Contradiction:
     """Distance of an estimate from the nearest physically consistent robot.
 
     Attributes:
-        distance: in standard deviations (Mahalanobis); up to `MAX_TIMES` times `allowed` only an approximation.
+        distance: distance in standard deviations (Mahalanobis); up to `MAX_TIMES` times `allowed` only an
+            approximation.
         allowed: 95 % limit of the distance for a correct model.
-        unexplained: of the weighted torques by the nearest consistent robot, in addition to the estimate [%].
+        unexplained: share of the weighted torques that the nearest consistent robot leaves unexplained beyond the
+            estimate [%].
     """
 
     distance: float

@@ -3,16 +3,16 @@
     state x = [q, v, χ],   q, v ← one step under the measured torques with parameters χ,   χ ← χ,   seen: q
 
 (Gautier & Poignet 2001; Leboutet et al. 2021, section 6.1). One pass over all recordings; the robot alone is simulated,
-so no controller is asked for. What the survey tunes by hand, the data determine, or it follows from the model (our
-choices):
+so no controller is asked for. Settings that the survey tunes by hand are determined by the data or follow from the
+model (our choices):
 
-* noise of q: the level of each log's spectrum, the filtered log thinned to `rate_factor` times its cut-off;
-* process noise: that of the torques, by the residuals of weighted least squares, through ½ T² M⁻¹ and T M⁻¹;
-* parameters have none: they are constants, and a filter that knows its other noise needs none to converge;
-* they start where `simulated_robot.start_of` says, as uncertain as `start_sigmas` standard deviations of least
-  squares, or as far from it as they are: that is next to nothing compared with what a pass adds.
+* noise of q: the level of each log's spectrum, the filtered log thinned to `rate_factor` times its cut-off; * process
+noise: that of the torques, by the residuals of weighted least squares, through ½ T² M⁻¹ and T M⁻¹; * parameters have
+none: they are constants, and a filter that knows its other noise needs none to converge; * they start where
+`simulated_robot.start_of` says, with a standard deviation of `start_sigmas` times that of least squares, or of their
+distance from least squares if that is larger: little information compared with that of a pass.
 
-Where innovations are larger than the filter says, the covariance is widened by their mean square.
+Where innovations are larger than the filter predicts, the covariance is widened by their mean square.
 """
 
 from collections.abc import Iterator
@@ -39,7 +39,7 @@ class _KalmanFilter(Method):
     """Identification by a Kalman filter whose states include the parameters.
 
     Attributes:
-        kind: rule and form.
+        kind: rule of the filter and form of its covariance.
     """
 
     needs_simulation: bool = field(default=True, kw_only=True)

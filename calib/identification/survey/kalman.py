@@ -43,9 +43,9 @@ class Belief:
     """Mean and covariance of a state.
 
     Attributes:
-        mean: (L,).
+        mean: (L,) mean of the state.
         spread: (L, L) covariance, or its lower triangular root S.
-        root: which of them.
+        root: whether `spread` is the root.
     """
 
     mean: np.ndarray

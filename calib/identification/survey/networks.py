@@ -33,7 +33,7 @@ def adaline(data: Samples, start: np.ndarray, rate: float = 1.0, steps: int = ST
 
     Args:
         data: N samples.
-        start: (p,).
+        start: (p,) initial weights.
         rate: η; 1 minimises a sample's residual along its gradient.
         steps: samples seen; each once before any comes back.
     """
@@ -66,7 +66,7 @@ def hopfield(
 
     Args:
         factor: (p + 1, p + 1) triangle [R z; 0 ρ] of [W y], not weighted.
-        start: (p,) of x.
+        start: (p,) initial x.
         bound: α, above all |x|.
 
     Raises:
@@ -158,7 +158,7 @@ class _Hopfield(_Network):
 
 
 def _off(fit: LinearFit, values: np.ndarray, group_std: np.ndarray) -> LinearFit:
-    """Return a fit moved to other values, by the distance less certain."""
+    """Return a fit moved to other values (p,), with its covariance enlarged by the distance."""
     away = values - fit.estimate.values
     covariance = fit.estimate.covariance + np.outer(away, away)
     estimate = replace(fit.estimate, values=values, covariance=covariance)

@@ -7,11 +7,11 @@ With joint torque sensors (rows link, both) both compare their torques too, whic
 ones are those of the bodies and the link side along the simulated motion, filtered like the recorded one (our choice).
 
 q_s and tau_s of the loop simulated without noise (Leboutet et al. 2021, sections 5.1 and 5.2, after Landau 1979;
-Gautier, Janot & Vandanjon 2013), each joint weighed by what is left of it. Gauss and Newton's steps, damped, need
-∂q_s/∂χ and ∂tau_s/∂χ: here the tangents of the simulation itself in one pass (`tangent_kernels`) where differences take
-one simulation per parameter, as they do for parallel robots. Torques of redundant actuators are compared on the
-platform's coordinates, as least squares takes them. What is left is what noise did in the loop, correlated over time;
-the covariance H⁻¹ S H⁻¹ knows of it, S the scatter of the scores (`score_covariance`).
+Gautier, Janot & Vandanjon 2013), each joint weighted by its residuals. Damped Gauss–Newton steps need ∂q_s/∂χ and
+∂tau_s/∂χ: here the tangents of the simulation itself in one pass (`tangent_kernels`) where differences take one
+simulation per parameter, as they do for parallel robots. Torques of redundant actuators are compared on the platform's
+coordinates, as least squares takes them. The residuals are the effect of noise in the loop, correlated over time; the
+covariance H⁻¹ S H⁻¹ accounts for this, with S the scatter of the scores (`score_covariance`).
 
 What slides call CLIE, (ZᵀZ)⁻¹Zᵀy with Z the simulated observation matrix, is the survey's DIDIM; so it is here.
 """
@@ -49,7 +49,7 @@ class _OutputError(Method):
     """Identification that fits the simulated closed loop to the recordings.
 
     Attributes:
-        torques: whether torques are compared, and not positions.
+        torques: whether torques are compared (CLIE) instead of positions (CLOE).
     """
 
     needs_controller: bool = field(default=True, kw_only=True)
@@ -62,7 +62,7 @@ class _OutputError(Method):
     def takes(self, rows: TorqueRows) -> bool:
         """Return whether it estimates from these torque rows.
 
-        Torques of sensors alone do not tell how the motors move; positions do.
+        For CLIE sensors' torques alone do not suffice, since they do not identify the motors' motion.
         """
         return super().takes(rows) and (not rows.sensed or rows.with_motors or not self.torques)
 

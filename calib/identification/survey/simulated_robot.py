@@ -62,11 +62,11 @@ def simulate_tangents(
     """Return a noise-free simulated motion along a reference, and its exact derivatives with respect to the parameters.
 
     Args:
-        plant: whose friction hangs on position and velocity alone.
+        plant: plant whose friction depends on position and velocity alone.
         columns: (c,) indices of the parameters.
         every: control periods per sample.
         relative: (n, c) slopes of the logarithm of all gains of a joint by the parameters, where the gains follow them
-            (`calib.identification.closed_loop.loop_recordings.Loop.design`); None: they stay.
+            (`calib.identification.closed_loop.loop_recordings.Loop.design`); None: the gains are constant.
 
     Raises:
         CalibError: where the inertia is not positive definite, friction too stiff, or of a kind without slopes.
@@ -134,10 +134,10 @@ def simulate_differences(
     steps: np.ndarray,
     every: float = 1,
 ) -> Sensitivities:
-    """Return what `simulate_tangents` does of a robot without tangents, by one more simulation per parameter.
+    """Return the result of `simulate_tangents` for a robot without tangents, by one simulation per parameter.
 
     Args:
-        plant: of a model's `plant`, with the payloads on board.
+        plant: result of a model's `plant`, with the mounted payloads.
         steps: (c,) of the forward differences: so small that the motion is linear, see `BelievedRobot.steps`.
     """
 
@@ -224,10 +224,10 @@ class BelievedRobot:
     """Robot model to be simulated with the parameters of an identification problem.
 
     Attributes:
-        model: with richer friction, where the problem has any.
+        model: model including the problem's richer friction.
         columns: (p,) place of each of the problem's parameters among the plant's; without motor torques, those of the
             motors follow.
-        plant: with all parameters zero; of another model than a serial arm's, what its `plant` returns.
+        plant: plant with all parameters zero; for a model that is no serial arm, the result of its `plant`.
         steps: (p,) of differences for a robot without tangents, 0.01 σ of least squares; None for a serial arm.
     """
 
@@ -275,7 +275,7 @@ def serial_arm(problem: IdentificationProblem, method: Method) -> Identification
     """Return the model of a problem; raise unless it is a serial arm with torque rows that the method takes.
 
     Raises:
-        UsageError: for another.
+        UsageError: for any other model.
     """
     model = problem.model
     if not isinstance(model, IdentificationModel) or not method.takes(model.torque_rows):
@@ -287,11 +287,11 @@ def serial_arm(problem: IdentificationProblem, method: Method) -> Identification
 def believed_robot(problem: IdentificationProblem, method: Method, steps: np.ndarray | None = None) -> BelievedRobot:
     """Return the robot model that simulates an identification problem.
 
-    Without motor torques (rows link) nothing in the problem tells how the motors move: inertia, friction and offset of
-    each are parameters more, the last ones (our choice).
+    Without motor torques (rows link) the problem does not identify the motors' motion: inertia, friction and offset of
+    each motor are appended as further parameters (our choice).
 
     Args:
-        steps: of a model that is no serial arm, of the differences; None: such a model is refused.
+        steps: (p,) steps of differences for a model that is no serial arm; None: such a model is refused.
 
     Raises:
         UsageError: for a model that cannot be simulated, or torque rows that the method does not take.
@@ -338,12 +338,12 @@ def start_of(
     """Return initial parameters (p,): the given ones, or those nearest to least squares that can be simulated.
 
     Args:
-        plain: (p,) of weighted least squares.
+        plain: (p,) estimate by weighted least squares.
         inertia: (n,) of a regular robot, which nothing couples [kg m² or kg].
         simulated: raises `CalibError` where values cannot be simulated.
 
     Raises:
-        CannotSimulate: where none can be.
+        CannotSimulate: where no values can be simulated.
     """
     if problem.start is not None:
         return np.array(problem.start, dtype=float)

@@ -245,10 +245,10 @@ def propagate(
 
     Args:
         identification: the model and its rows.
-        robot: the one it was made on; where it brings no covariance (K, K), the geometry is taken as exact. Where
-            joint corrections move the links, their coefficients' uncertainty takes part.
-        cases: its training data.
-        progress: called with a few words at each part.
+        robot: the robot of the identification; without a covariance (K, K) its geometry is taken as exact. Where joint
+            corrections move the links, the uncertainty of their coefficients is included.
+        cases: training data of the identification.
+        progress: called with a short text at each part; None: not called.
     """
     robot = as_calibrated(robot)
     chain, covariance = robot.chain, robot.covariance
@@ -509,7 +509,8 @@ def compare(
 ) -> GeometryComparison:
     """Return the comparison of the estimate with one from the same torques on the nominal geometry.
 
-    Both by weighted least squares with the same weights; the difference is added to the identification's estimate.
+    Both are estimated by weighted least squares with the same weights; the difference is added to the identification's
+    estimate.
     """
     fitted = identification.fitted
     weighting = estimator(identification)
@@ -539,18 +540,17 @@ def compare(
 
 
 def _gain(inverse: np.ndarray, weighting: _Estimator, rows: ObservationRows) -> np.ndarray:
-    """Return A⁻¹ Wᵀ R⁻¹ (p, M rows), the estimate's change by the torque of each row."""
+    """Return A⁻¹ Wᵀ R⁻¹ (p, M rows), the change of the estimate per unit of each row's torque."""
     weight = weights(weighting, rows, weighting.deviation**2)
     return inverse @ (stacked(rows) * weight[:, None]).T
 
 
 def deflection_sensitivity(found: Identification, robot: CalibratedChain, cases: Sequence[Case]) -> np.ndarray:
-    """Return the derivative (p, E) of the estimate by the corrections' coefficients, zero for those left out.
+    """Return the derivative (p, E) of the estimate by the joint corrections' coefficients; zero for unused ones.
 
         dφ/dc = -(Wᵀ R⁻¹ W)⁻¹ Wᵀ R⁻¹ Σ_s ∂τ/∂s b_s,    s one of q, v, a of the joint, b_s the basis or its derivative
 
-    as in `sensitivity`, of which the part by the residual is left out: it vanishes with
-    the residual.
+    as in `sensitivity`, without the part that is proportional to the residual.
     """
     terms = robot.deflection
     chain = robot.complete

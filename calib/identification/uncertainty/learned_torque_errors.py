@@ -1,13 +1,13 @@
-"""What the expected errors of torques are learned from: errors of a model on training time that was left out.
+"""Estimation of the expected torque errors from a model's errors on held-out training time.
 
-κ, v and u of `calib.identification.uncertainty.torque_errors` are the most probable ones of errors on time left out:
-block by block, and each half from the other. A few blocks of one joint identify the three badly, and κ = 0 would deny
-what the covariance says of itself: each joint's are regularised to those of all, and to κ = 1. Such an error is what
-the model leaves of the torque as recorded, ripple and noise above its band included, and what its prediction changes by
-where the parameters are estimated without that time. A joint that stands has a floor of its own: errors at rest, each
-standstill counted once, and the variance F_c² / 3 of a friction that may be anything within ± F_c, worth `BORROWED`
-standstills. How much the sizes of errors in motion differ from one block to another says how far those of other motion
-may: the stated sigma is that of which 1.96 hold 95 % where the logarithm of their size has a t distribution.
+κ, v and u of `calib.identification.uncertainty.torque_errors` are the most probable values given errors on held-out
+time: each block, and each half from the other. A few blocks of one joint identify the three badly, and κ = 0 would
+neglect the covariance: each joint's values are regularised towards those of all joints, and towards κ = 1. An error
+consists of the residual of the torque as recorded, ripple and noise above the band included, and of the change of the
+prediction when parameters are estimated without the held-out time. A joint at rest has a separate floor: errors at
+rest, each standstill counted once, and the variance F_c² / 3 of a friction that may be anything within ± F_c, worth
+`BORROWED` standstills. How much the sizes of errors in motion differ between blocks shows how much they may differ in
+other motion: 1.96 of the stated sigma cover 95 % of errors if the logarithm of their size has a t distribution.
 """
 
 from collections.abc import Sequence
@@ -73,7 +73,7 @@ class _HeldOut:
     """Prediction errors on held-out time, and the terms of their expected variance.
 
     Attributes:
-        errors: (m, rows) of the torques [N m or N].
+        errors: (m, rows) errors of the torques [N m or N].
         variance_terms: (m, rows, 3) variance due to the parameters, 1, and log(1 + d²).
         moves: (m, rows) whether the row's joint moves.
     """
@@ -135,7 +135,7 @@ def learn_torque_errors(
 
 
 def _interval_factors(folds: Sequence[_HeldOut], weights: np.ndarray, run_count: int) -> np.ndarray:
-    """Return the factors (rows,) on predicted sigmas with which 1.96 of them cover 95 % of errors on other motion.
+    """Return factors (rows,) of predicted sigmas, such that ± 1.96 sigma cover 95 % of errors on other motion.
 
     The size of a row's normalised errors differs from run to run. The variance of its logarithm over runs, regularised
     towards the mean of all rows, says how large errors on one more run may be: Student's t with that variance.
@@ -328,7 +328,7 @@ def _hold_out(
 ) -> _HeldOut:
     """Return the errors on the blocks of a run, predicted by the parameters that all other blocks give.
 
-    No error counts for more than the torque itself: a fold that fails wholly says nothing of how the whole model errs.
+    Errors are limited to the size of the torque: a fold that fails completely does not represent the final model.
 
     Args:
         standing_speeds: (n,) speeds below which a joint stands.
@@ -379,9 +379,9 @@ def _rest_floors(folds: Sequence[_HeldOut], friction: np.ndarray, weights: np.nd
 def _variance_weights(folds: Sequence[_HeldOut], run_count: int) -> np.ndarray:
     """Return the weights (rows, 3) of the error variance's terms in motion, regularised towards those of all rows.
 
-    In units of a row's own mean square every row's κ, and its u over v, are of one kind. A row's own errors are
-    supplemented by those of all other rows, worth `BORROWED` blocks, and by two expectations: the covariance is as it
-    says (worth a block), and errors grow beyond the training range, which folds hardly leave where motion repeats.
+    In units of a row's mean square error, κ and u / v are comparable between rows. A row's errors are supplemented by
+    those of all other rows, worth `BORROWED` blocks, and by two expectations: that the covariance is correct (worth a
+    block), and that errors grow beyond the training range, which folds hardly leave where motion repeats.
     """
     errors = np.concatenate([fold.errors for fold in folds])
     terms = np.concatenate([fold.variance_terms for fold in folds])
@@ -423,7 +423,7 @@ def _variance_weights(folds: Sequence[_HeldOut], run_count: int) -> np.ndarray:
 def _normalised_errors(folds: Sequence[_HeldOut], row: int, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return for one row the log rms of error over predicted sigma in each fold, and all errors over sigma and rms.
 
-    In motion; of a fold in which its joint does not move, at rest.
+    Errors are those in motion, or at rest in a fold in which the row's joint does not move.
     """
     squares, variances = [], []
     for fold in folds:

@@ -3,11 +3,11 @@
     E e_j² = κ_j w_j Σ w_jᵀ + v_j + u_j log(1 + d_j²)
 
 with w_j the torque row's regressor, Σ the parameters' covariance, and d_j the distance of its joint's q, v, a from the
-training range, each in units of its standard deviation. What parameters do far from there is in Σ; what
-no parameter explains (friction of another form, ripple) is of one size and soon forgets where it was: the logarithm. κ,
-v and u come from errors on time left out (`calib.identification.uncertainty.learned_torque_errors`).
+training range, each in units of its standard deviation. The effect of the parameters far from the training range is in
+Σ; unmodelled effects (friction of another form, ripple) have a limited size and grow slowly with distance, hence the
+logarithm. κ, v and u come from errors on time left out (`calib.identification.uncertainty.learned_torque_errors`).
 
-`Uncertainty` holds the parameters' share alone: standard deviations of torques from the covariance.
+`Uncertainty` has the parameters' share alone: standard deviations of torques from the covariance.
 """
 
 from collections.abc import Collection, Sequence
@@ -134,7 +134,7 @@ class TorqueDiscrepancy:
         floor: (rows,) v [N² m² or N²], variance of unmodelled effects.
         beyond: (rows,) u, additional variance per log(1 + d²), d the distance from the training data.
         lower, upper, scale: (3, n) least and largest q, v, a of the training data, and their standard deviations.
-        rest: (rows,) in place of v while a joint stands [N² m² or N²]; () in files of earlier versions.
+        rest: (rows,) variance that replaces v while a joint is at rest [N² m² or N²]; () in files of earlier versions.
         standing: (n,) speeds below which a joint stands [rad/s or m/s]; () in files of earlier versions.
     """
 
@@ -234,7 +234,7 @@ class TorqueIntervals:
     Attributes:
         index: (M,) indices of the samples.
         sigma: (M, rows) predicted standard deviations [N m or N].
-        contains: (M, rows) whether the actual errors are within 1.96 of them.
+        contains: (M, rows) whether the actual errors are within 1.96 predicted standard deviations.
         valid: (M,) False at lost samples, which are not counted.
         standing: (M, rows) whether the row's joint stands.
         extrapolated: (3, M, n) whether the motion leaves the training range, by q, v, a and joint.
@@ -265,7 +265,7 @@ class TorqueIntervals:
 
     @property
     def median(self) -> np.ndarray:
-        """Median half width of the interval in motion (rows,) [N m or N]; at rest, where a joint does not move."""
+        """Median half width of interval in motion (rows,) [N m or N]; that at rest for a joint that does not move."""
         moving = self._median(~self.standing)
         return np.where(np.isfinite(moving), moving, self._median(self.standing))
 
