@@ -1,4 +1,4 @@
-"""Findings on hypotheses that explain recordings better than what was stated: gravity, loads (catalogue, chapter 9)."""
+"""Findings on hypotheses that explain recordings better than the stated gravity or loads (catalogue, chapter 9)."""
 
 from collections.abc import Sequence
 
@@ -17,9 +17,10 @@ MAX_COMPARED = 12  # recordings in which an unstated load is looked for (our cho
 
 
 def gravity_hypotheses(inputs: IdentificationInputs) -> GravityHypotheses | None:
-    """Return what the training recordings say of gravity; None where they hold no motor torques, or too few samples.
+    """Return how well other gravity vectors explain the training recordings; None without motor torques or enough
+    samples.
 
-    Recordings with one payload, or without any, are looked at together: those with the most samples.
+    Of the recordings grouped by payload, the group with the most samples is used.
     """
     if not isinstance(inputs.chain, Chain) or not inputs.options.settings.torque_rows.has_bodies:
         return None
@@ -96,5 +97,5 @@ def _typical(shares: np.ndarray) -> float:
 
 
 def _vector(vector: np.ndarray, between: str) -> str:
-    """Return a vector (3,) [m/s²] as text, as an option takes it."""
+    """Return a vector (3,) [m/s²] as text, with the components separated as an option expects."""
     return between.join(f"{component:.4g}" for component in np.round(vector, 3) + 0.0)

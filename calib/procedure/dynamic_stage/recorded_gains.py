@@ -31,10 +31,10 @@ class FoundGains:
     """Drive gains that convert currents to torques.
 
     Attributes:
-        options: the options, with payload parameters identified together with the gains.
-        gains: (n,) for recordings without stated gains; None if not needed.
-        found: the identification of gains; None without one.
-        unit: of the torques.
+        options: the options, with payload parameters that were identified together with the gains.
+        gains: (n,) gains for recordings without stated gains; None if not needed.
+        found: the identification of the gains; None if they were not identified.
+        unit: unit of the converted torques.
         notes: remarks for the user.
     """
 
@@ -50,7 +50,9 @@ class FoundGains:
         return () if self.found is None else self.found.own
 
     def for_motion(self, motion: Motion, options: FileSettings) -> np.ndarray | None:
-        """Return the gains (n,) for a motion, from options, identification or file; None for torques."""
+        """Return the gains (n,) for a motion, from options, identification or file; None if it has torques, not
+        currents.
+        """
         if options.gains is not None:
             if len(options.gains) not in (1, motion.n):
                 raise UsageError(f"gains: {len(options.gains)} values for {motion.n} joints ({motion.file})")

@@ -264,7 +264,7 @@ def resting_parameters(identification: Identification[RegressorModel]) -> Restin
 
 
 def _negative(identification: Identification[RegressorModel]) -> list[Finding]:
-    """Return the finding on drive inertias and friction that are negative by more than `SURELY` sigmas."""
+    """Return the finding on drive inertias and friction parameters that are negative by more than `SURELY` σ."""
     estimate = identification.fitted.estimate
     names = []
     for name, term, value, sigma in zip(identification.names, identification.terms, estimate.values, estimate.sigma):
@@ -274,7 +274,7 @@ def _negative(identification: Identification[RegressorModel]) -> list[Finding]:
 
 
 def _unmodelled(identification: Identification) -> list[Finding]:
-    """Return the finding on joints with autocorrelated residuals, whose sigmas are valid for this motion only."""
+    """Return the finding on joints with autocorrelated residuals, whose σ are valid for this motion only."""
     inflation = np.nan_to_num(identification.fitted.inflation)
     rows = identification.settings.torque_rows.numbered(identification.dynamics.model.n)
     correlated = np.flatnonzero(inflation >= MAX_CORRELATED_ROWS)

@@ -1,18 +1,18 @@
 """Predicted σ of the parameters and torques that a motion identifies, before the robot moves.
 
-With Y one sample's regressor and σ_j the error of joint j's torque that no parameter explains, a log of R independent
-rows per joint leaves the base parameters with the covariance
+With Y the regressor of one sample and σ_j the standard deviation of joint j's torque error that no parameter explains,
+a log of R independent rows per joint yields the base parameters with the covariance
 
     C = (R · mean over the period of Σ_j Y_jᵀ Y_j / σ_j²)⁻¹,
 
-and a torque on other motion with the variance Y C Yᵀ. On a calibrated robot an error g of the geometry, the same in all
-logs, adds to both (`calib.identification.uncertainty.geometry_uncertainty`): the parameters err by S g = -C Σ Yᵀ
-(∂Y/∂g φ) g / σ²,
-with earlier motions C (C_before⁻¹ S_before g - …), and torques by Y S g + (∂Y/∂g φ) g. A design minimises the part of
-the torques' errors alone. R counts the rows that `calib identify` keeps: twice the band
-that its own rules read from the accelerations. What is not known before a log is σ_j: noise, and friction that no term
-holds. It is taken as the limits file states it ([noise]), or as a share of the torque limits, stated or
-`DEFAULT_NOISE`; all sigmas but the geometry's part go with it in proportion.
+and the torque of another motion with the variance Y C Yᵀ. On a calibrated robot an error g of the geometry, which is
+the same in all logs, adds to both (`calib.identification.uncertainty.geometry_uncertainty`): the parameters err by
+S g = -C Σ Yᵀ (∂Y/∂g φ) g / σ², with earlier motions by C (C_before⁻¹ S_before g - …), and the torques by
+Y S g + (∂Y/∂g φ) g. A design minimises only the part from torque errors. R is the number of rows that
+`calib identify` keeps: twice the identification band, computed from the accelerations by the same rules. Before a log
+exists, σ_j is unknown: it consists of noise, and of friction that no term models. It is taken from the limits file
+([noise]), or as a share of the torque limits, stated or `DEFAULT_NOISE`; all predicted σ except the geometry's part are
+proportional to it.
 """
 
 from collections.abc import Callable, Sequence
@@ -58,10 +58,10 @@ class MotionPrediction:
     """σ predicted for a log of a motion.
 
     Attributes:
-        seconds: of motion.
-        rows_per_joint: independent ones.
-        torque_sigma: (n,) rms of the predicted torque's sigma over the typical task [N m or N].
-        torque_sigma_share: the same, rms over the joints, as a share of the torque limits.
+        seconds: duration of the motion.
+        rows_per_joint: number of independent rows per joint.
+        torque_sigma: (n,) rms of the predicted torque's σ over the typical task [N m or N].
+        torque_sigma_share: rms of `torque_sigma` over the joints, as a share of the torque limits.
     """
 
     seconds: float
@@ -71,9 +71,10 @@ class MotionPrediction:
 
 
 class PredictedSigma(NamedTuple):
-    """A row of ``prediction.csv``: a parameter, its value if known, and the sigma predicted for the motion as run.
+    """A row of ``prediction.csv``: a parameter, its value if known, and the σ predicted for the motion as run.
 
-    `sigma_before` is that of an identification that the motion adds to; `sigma_geometry` the geometry's part of sigma.
+    `sigma_before` is the σ of the identification that the motion complements; `sigma_geometry` the geometry's part of
+    σ.
     """
 
     name: str
