@@ -33,7 +33,7 @@ def gravity_hypotheses(inputs: IdentificationInputs) -> GravityHypotheses | None
 
 
 def gravity_findings(hypotheses: GravityHypotheses | None, joints: Sequence[str]) -> list[Finding]:
-    """Return the findings that gravity has another direction, or is not in the torques of some joints."""
+    """Return the findings that gravity has another direction, or does not act on the torques of some joints."""
     if hypotheses is None:
         return []
     findings = []
@@ -58,10 +58,11 @@ def gravity_findings(hypotheses: GravityHypotheses | None, joints: Sequence[str]
 def load_findings(inputs: IdentificationInputs, gravity: Sequence[float] | None) -> list[Finding]:
     """Return the findings that a recording carries a load which the options do not state.
 
-    Recordings with the same stated payload are compared, training and unseen ones.
+    Recordings with the same stated payload, training and unseen, are compared with each other.
 
     Args:
-        gravity: in the base frame [m/s²], where it is not the robot's own.
+        inputs: the recordings.
+        gravity: gravity (3,) in the base frame [m/s²]; None: that of the robot's description.
     """
     rows = inputs.options.settings.torque_rows
     if not isinstance(inputs.chain, Chain) or inputs.unit != TORQUE or not rows.has_bodies:

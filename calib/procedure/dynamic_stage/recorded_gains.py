@@ -69,7 +69,15 @@ def find_gains(
     training: Sequence[str],
     say: Callable[[str], None],
 ) -> FoundGains:
-    """Return the drive gains that convert the currents of `motions` (path → motion) to torques."""
+    """Return the drive gains that convert the currents of `motions` (path → motion) to torques.
+
+    Args:
+        chain: the arm.
+        options: options of the identification; a stated pair of recordings with a known payload determines the gains.
+        motions: path → motion of all recordings.
+        training: paths of the training recordings, from which relative gains are identified.
+        say: called with the name of each step.
+    """
     if options.gain_pair is not None:
         say("drive gains")
         return _from_pair(chain, options, options.gain_pair, motions)
@@ -90,7 +98,7 @@ def find_gains(
 
 
 def _from_pair(chain: Chain, options: IdentifyOptions, pair: GainPair, motions: Mapping[str, Motion]) -> FoundGains:
-    """Return the drive gains in N m from recordings without and with a payload of known mass."""
+    """Return the absolute drive gains, identified from recordings without and with a payload of known mass."""
     settings = options.settings
     known_values = {f"M{label}": load.mass for label, load in settings.payloads.items() if load.mass is not None}
     for label, load in settings.payloads.items():
@@ -119,7 +127,7 @@ def _from_pair(chain: Chain, options: IdentifyOptions, pair: GainPair, motions: 
 
 
 def _relative(chain: Chain, options: IdentifyOptions, currents: Sequence[tuple[str, Motion]]) -> FoundGains:
-    """Return the drive gains relative to the joint with the largest current; all torques are then in its amperes."""
+    """Return the drive gains relative to the joint with the largest current, so that all torques are in its amperes."""
     if not currents:
         return FoundGains(options, None, None, "A", ("drive gains are unknown: torques are currents [A]",))
     cases = [make_case(path, motion, carried=options.file_settings(path).payload) for path, motion in currents]
@@ -176,7 +184,7 @@ def _identify(
 def _case(
     name: str, chain: Chain, options: IdentifyOptions, motions: Mapping[str, Motion], carried: tuple[str, ...]
 ) -> Case:
-    """Return the case of currents, from a given recording or from a file in the folder of the options file."""
+    """Return the case of a recording of currents: one of `motions`, or a file in the folder of the options file."""
     file = parse_cut(name)[0]
     for path, motion in motions.items():
         if path == name or Path(parse_cut(path)[0]).name == file:
@@ -194,7 +202,7 @@ def _case(
 
 
 def _poor_gains(gains: DriveGains) -> list[str]:
-    """Return a note on gains with a large sigma; empty without."""
+    """Return a note on gains with a large σ; [] if there are none."""
     joints = []
     for j, (gain, sigma) in enumerate(zip(gains.gains, gains.sigma)):
         if sigma > MAX_GAIN_SIGMA * abs(gain):

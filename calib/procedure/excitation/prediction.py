@@ -87,7 +87,9 @@ class PredictedSigma(NamedTuple):
 
 
 class Task(NamedTuple):
-    """Regressors (N, rows, c) at states of a typical task, and the torques' changes (N, rows, r) by the geometry."""
+    """Regressors (N, rows, c) at states of a typical task, and the torques' changes (N, rows, r) by the geometry's
+    errors.
+    """
 
     regressors: np.ndarray
     felt: np.ndarray
@@ -98,11 +100,12 @@ class MotionOutlook:
     """Predicted σ of a designed motion, and of motions of other lengths.
 
     Attributes:
-        noise: (n,) taken as the torques' error [N m or N]; noise_share: of the torque limits.
-        own: of the motion as it is to be run; by_period: of other lengths. Longer ones run the same motion again,
-            shorter ones are designed quickly.
-        before: torque_sigma_share of an identification that the motion adds to, and torque_sigma_before (n,) [N m or
-            N] its torque_sigma; None without one.
+        noise_share: assumed torque error as a share of the torque limits.
+        noise: (n,) assumed torque error [N m or N].
+        own: prediction for the motion as it is to be run.
+        by_period: predictions for other lengths: longer ones repeat the same motion, shorter ones are designed quickly.
+        before: `torque_sigma_share` of the identification that the motion complements; None without one.
+        torque_sigma_before: (n,) `torque_sigma` of that identification [N m or N]; None without one.
     """
 
     noise_share: float
@@ -120,14 +123,14 @@ def foretell(
     motion: SearchResult,
     problem_of: Callable[[float], ExcitationProblem],
 ) -> tuple[MotionOutlook | None, Sequence[PredictedSigma]]:
-    """Return the predicted sigmas of torques and parameters; None if a joint has no torque limit.
+    """Return the predicted σ of torques (None if a joint has no torque limit) and of the parameters (then empty).
 
     Args:
         inputs: the robot, its limits and model.
-        settings: of the design.
-        problem: that was solved.
-        motion: that solves it.
-        problem_of: a period [s] -> the problem with it.
+        settings: settings of the design.
+        problem: optimisation problem of the design.
+        motion: solution of the problem.
+        problem_of: function of a period [s] that returns the problem with this period.
     """
     limits, noise = inputs.limits.torque, inputs.limits.noise
     if not np.isfinite(limits).all():
@@ -176,7 +179,7 @@ def _parameter_rows(
     Args:
         inputs: the robot and its model.
         root, shifts: see `_prediction`.
-        sigmas_before: (c,) stated by the identification that the motion adds to.
+        sigmas_before: (c,) σ of the identification that the motion complements; None without one.
     """
     model, columns = inputs.model, inputs.columns.kept
     values = np.full(len(model.exact.names), np.nan)
@@ -199,7 +202,9 @@ def _parameter_rows(
 
 
 def known_sigmas(inputs: ExcitationInputs, task: Task) -> tuple[tuple[np.ndarray, float], list[float]]:
-    """Return the σ of torques on a task (see `_torque_sigma`), and of the parameters, that an identification states."""
+    """Return the σ that an earlier identification states: of torques on a task (see `_torque_sigma`), and of
+    parameters.
+    """
     root = _root(_information_root(inputs))
     shifts = _shifts_before(inputs)
     sigmas = np.linalg.norm(np.hstack([root, shifts]), axis=1)
@@ -207,7 +212,7 @@ def known_sigmas(inputs: ExcitationInputs, task: Task) -> tuple[tuple[np.ndarray
 
 
 def _information_root(inputs: ExcitationInputs) -> np.ndarray:
-    """Return a root (c, c) of the information matrix of earlier motions, for the columns of the design."""
+    """Return a square root W (c, c) of the earlier motions' information matrix Wᵀ W, for the columns of the design."""
     assert inputs.prior is not None
     columns = inputs.columns.kept
     values, V = np.linalg.eigh(inputs.prior.information[columns][:, columns])
@@ -229,7 +234,7 @@ def _geometry_torques(inputs: ExcitationInputs, q: np.ndarray, v: np.ndarray, a:
 
 
 def _shifts_before(inputs: ExcitationInputs) -> np.ndarray:
-    """Return what the principal errors of the geometry did to the parameters (c, r) of an earlier identification."""
+    """Return the shifts (c, r) of an earlier identification's parameters by the principal errors of the geometry."""
     if inputs.geometry is None:
         return np.zeros((len(inputs.columns.names), 0))
     return inputs.geometry.before[inputs.columns.kept]
@@ -242,9 +247,9 @@ def _torque_sigma(
 
     Args:
         inputs: the robot and its model.
-        task: the states.
-        root: (c, c) of the parameters' covariance.
-        shifts: (c, r) of the parameters by the geometry's errors.
+        task: states of the task.
+        root: (c, c) square root of the parameters' covariance.
+        shifts: (c, r) shifts of the parameters by the geometry's errors.
     """
     by_torque_errors = task.regressors @ root
     by_geometry = task.regressors @ shifts + task.felt
@@ -255,7 +260,7 @@ def _torque_sigma(
 
 
 def task_states(inputs: ExcitationInputs, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return q, v, a (TASK_STATES, n) of a typical task."""
+    """Return q, v, a (TASK_STATES, n) of a typical task, drawn with the seed."""
     n = inputs.chain.n
     box = inputs.limits.positions
     low = np.where(np.isfinite(box.lower), box.lower, -np.pi)
@@ -273,7 +278,7 @@ def task_states(inputs: ExcitationInputs, seed: int) -> tuple[np.ndarray, np.nda
 
 
 def task_of(inputs: ExcitationInputs, seed: int) -> Task:
-    """Return the typical task of `task_states`."""
+    """Return the typical task: regressors and effects of the geometry's errors at the states of `task_states`."""
     states = task_states(inputs, seed)
     regressors = inputs.model.exact.regressor(*states)[:, :, inputs.columns.kept]
     return Task(regressors, _geometry_torques(inputs, *states))
@@ -284,7 +289,8 @@ def _prediction(
 ) -> tuple[MotionPrediction, np.ndarray, np.ndarray]:
     """Return the prediction for `repeat` periods of a motion, and the two parts of the parameters' errors.
 
-    They are a root (c, c) of the covariance by the torques' errors, and the shifts (c, r) by the geometry's errors.
+    The parts are a square root (c, c) of the covariance by torque errors, and the shifts (c, r) by the geometry's
+    errors.
     """
     exact, columns = inputs.model.exact, inputs.columns.kept
     period = family.period * factor
@@ -328,7 +334,9 @@ def _shortened(
     period: float,
     evaluations: int,
 ) -> tuple[Family, SearchResult] | None:
-    """Return a motion of a shorter period, or None; the search starts from the same path, scaled to keep its speeds."""
+    """Return family and motion of a shorter period; None if there is none. The search starts from the same, scaled
+    path.
+    """
     try:
         shorter = replace(problem_of(period), stretch=(1.0, 1.0))
     except ValueError:  # as many harmonics of a short period are beyond the resonance, or it is no whole sample
@@ -345,16 +353,18 @@ def _shortened(
 
 
 def write(rows: Sequence[PredictedSigma], folder: Path) -> Path:
-    """Write the parameters' predicted sigmas as CSV; value and rsd [%] are empty where the value is not known."""
+    """Write the parameters' predicted σ as CSV and return its path; value and rsd [%] are empty if a value is
+    unknown.
+    """
     header = list(PredictedSigma._fields)
     header[header.index("rsd")] = "rsd [%]"
     return files.write_table(folder / NAME, header, rows)
 
 
 def lines(outlook: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> list[str]:
-    """Return the predicted σ of torques as text, for this motion and for motions of other lengths.
+    """Return the predicted σ of torques as lines of text, for this motion and for motions of other lengths.
 
-    After an identification, the three parameters whose σ the motion lowers most follow.
+    If the motion complements an identification, the three parameters whose σ decreases most follow.
     """
     by_period = ""
     if outlook.by_period:
@@ -375,7 +385,7 @@ def lines(outlook: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> l
 
 
 def check_folder(folder: Path) -> None:
-    """Raise an error if a folder contains no prediction of `calib excite`."""
+    """Raise a UsageError if a folder contains no prediction of `calib excite`."""
     require((folder / NAME).is_file(), f"{folder} has no {NAME}: give the folder that calib excite wrote", UsageError)
 
 
@@ -385,10 +395,10 @@ class _Predicted:
 
 
 def compared_with_identification(folder: Path, outcome: IdentificationOutcome) -> str:
-    """Return a line that compares the predicted sigmas (folder of `calib excite`) with the identified ones.
+    """Return a line that compares the predicted σ (folder of `calib excite`) with the identified σ.
 
     Raises:
-        UsageError: if the folder contains no prediction, or one of other parameters.
+        UsageError: if the folder contains no prediction, or a prediction for other parameters.
     """
     check_folder(folder)
     outlook = read_json(folder / METRICS, WRITTEN_BY_EXCITE, _Predicted).prediction
