@@ -91,7 +91,7 @@ def _limit_for_good() -> None:
 
 
 def _set(threads: dict["LibController", int]) -> None:
-    """Set the thread numbers of libraries, from any thread: threadpoolctl 3.8 heeds one alone until it is cleared."""
+    """Set the thread numbers of libraries, from any thread; one threadpoolctl controller per call (version 3.8)."""
     for library, number in threads.items():
         clear = getattr(library, "clear_controlling_thread", lambda force: None)
         clear(force=True)
@@ -101,7 +101,9 @@ def _set(threads: dict["LibController", int]) -> None:
 
 @cache
 def _libraries() -> list["LibController"]:
-    """Return all loaded BLAS libraries: looking for them takes milliseconds, setting their threads microseconds."""
+    """Return all loaded BLAS libraries, cached, since the search takes milliseconds and setting threads
+    microseconds.
+    """
     from threadpoolctl import ThreadpoolController
 
     controllers = ThreadpoolController().select(user_api="blas").lib_controllers
