@@ -35,7 +35,9 @@ Recorded = str | Path | Recording
 
 
 class DynamicsModel(ChartedResult, Judged, identify.IdentificationOutcome):
-    """Identified dynamics with covariance and verdict. ``print`` shows errors on other motion, friction and verdict."""
+    """Identified dynamics with covariance and verdict. ``print`` shows errors on unseen motion, friction and
+    verdict.
+    """
 
     kind = BY_NAME["identification"]
     tab = (
@@ -45,7 +47,7 @@ class DynamicsModel(ChartedResult, Judged, identify.IdentificationOutcome):
 
     @property
     def residuals(self) -> DataFrame:
-        """Measured minus predicted torques of every recording, fitted or unseen, as a pandas DataFrame."""
+        """Return whether an option is repeated for each item; a list of numbers is one comma-separated text instead."""
         titles = self.found.settings.torque_rows.titles(self.inputs.chain.joint_names)
         header = ["file", "t [s]"]
         header += [f"{title} [{unit}]" for title, unit in zip(titles, self.inputs.row_units)]
@@ -57,7 +59,7 @@ class DynamicsModel(ChartedResult, Judged, identify.IdentificationOutcome):
 
     @property
     def robot(self) -> CalibratedChain:
-        """The robot of these dynamics."""
+        """The robot that the dynamics were identified on."""
         return self.inputs.robot
 
     @property
@@ -70,7 +72,9 @@ class DynamicsModel(ChartedResult, Judged, identify.IdentificationOutcome):
 
     @one_blas_thread()
     def torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the torques (N, rows) [N m or N] of a motion q, v, a (N, n) [rad or m, and per s, s²]."""
+        """Return the predicted torques (N, rows) [N m or N] of a motion q [rad or m], v [per s], a [per s²], each (N,
+        n).
+        """
         dynamics = self.found.dynamics
         q = np.asarray(q, dtype=float)
         v = np.asarray(v, dtype=float)
@@ -81,10 +85,11 @@ class DynamicsModel(ChartedResult, Judged, identify.IdentificationOutcome):
     def torque_sigma(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the standard deviations (N, rows) [N m or N] of predicted torques: ± 1.96 σ covers 95 %.
 
-        They include the part of recorded torques that no model within the filter's band explains.
+        They include the part of recorded torques that no model explains within the filter's band. Arguments as of
+        `torques`.
 
         Raises:
-            UsageError: for a model of too short a recording to estimate errors from.
+            UsageError: if the model's recordings were too short to estimate its errors.
         """
         if self.errors is None:
             raise UsageError("torque errors cannot be estimated, since the recording is too short: record longer")
@@ -101,7 +106,7 @@ class DynamicsModel(ChartedResult, Judged, identify.IdentificationOutcome):
         return folder.write_folder(self, Path(out), partial(outputs.write_model, plots=plots))
 
     def charts(self) -> dict[str, Chart]:
-        """Return what the figures show: measured and predicted torques, autocorrelations, friction."""
+        """Return the charts of the figures by name: measured and predicted torques, autocorrelations, friction."""
         from calib.procedure.report import dynamics_figures
 
         return dynamics_figures.figures(self)
@@ -119,7 +124,7 @@ class DynamicsModel(ChartedResult, Judged, identify.IdentificationOutcome):
         return data_frame(rows, ["name", "unit", "value", "sigma"])
 
     def section(self) -> Section:
-        """Return a report section with the errors on other motion, the friction, and the verdict."""
+        """Return a report section with the errors on unseen motion, the friction, and the verdict."""
         from calib.procedure.report import dynamics_section
 
         return dynamics_section.outcome_section(self)
@@ -161,25 +166,27 @@ def identify_dynamics(
 ) -> DynamicsModel:
     """Identify a robot's dynamics on its geometry, and judge them on unseen motion.
 
-    A robot that comes from a fit (``fit.robot``) brings the covariance of its geometry, which is added to that of the
-    estimate: Σ = Σ_torque + S Σ_geometry Sᵀ.
+    If the robot comes from a fit (``fit.robot``), the covariance of its geometry is added to that of the estimate:
+    Σ = Σ_torque + S Σ_geometry Sᵀ.
 
     Args:
-        robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``. Of a parallel robot the result has
+        robot, base, tip: arguments as of `calib.load`, its result, or ``fit.robot``. For a parallel robot, the result
+            has
             the same members.
-        recordings: logs of q and torque (or current): files, ``log.npz@0:9.4`` cut, or what `read_recording` returned.
-        settings: method, friction, drives, payloads, gains, filters, closed loop.
-        validate: recordings of other motion.
-        method, friction: in place of the settings'; see `methods`.
+        recordings: logs of q and torque (or current): files, ``log.npz@0:9.4`` cut, or results of `read_recording`.
+        settings: method, friction, drives, payloads, gains, filters, closed loop; None: defaults.
+        validate: recordings of other motion, to validate on.
+        method, friction: replace those of the settings, see `methods`; None: as in the settings.
         options: the settings as a TOML file (``calib formats identify-options``).
-        excitation: folder of `design_excitation`: reference of recordings that have none, for methods with a [loop].
-        seed: of everything random.
-        on_read: called with what was read, before the identification begins.
-        progress: called with a few words now and then.
+        excitation: folder of `design_excitation`, whose motion is the reference of recordings without one, for methods
+            with a [loop].
+        seed: seed of all random numbers.
+        on_read: called with the inputs before the identification begins.
+        progress: called with the name of each step; None: silent.
 
     Raises:
-        MeasurementError: for logs that cannot be right, naming row and column.
-        Unidentifiable: where the motion identifies no parameter.
+        MeasurementError: for implausible logs, naming row and column.
+        Unidentifiable: if the motion identifies no parameter.
     """
     require(
         settings is None or options is None,

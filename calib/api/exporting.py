@@ -35,14 +35,14 @@ def validate(
     """Validate a result on unseen poses or motion, and update its verdict.
 
     Args:
-        result: a fit or an identification; nothing is fitted again.
-        unseen: measurements or recordings, files or in memory, beside those it was judged on before.
+        result: a fit or an identification; its parameters stay unchanged.
+        unseen: measurements or recordings, as files or in memory, in addition to those it was validated on before.
 
     Returns:
-        The same result with the errors on all unseen rows and the verdict that follows.
+        The result with its errors on all unseen rows and the updated verdict.
 
     Raises:
-        MeasurementError: for files that cannot be right, naming row and column.
+        MeasurementError: for implausible files, naming row and column.
     """
     sources = listed(unseen)
     require(sources, "validate: unseen is empty; give poses or recordings to validate on", UsageError)
@@ -68,27 +68,30 @@ def export(
 ) -> tuple[str, ...]:
     """Write a calibrated robot, with identified dynamics if available, for other programs.
 
-    Of a fit: robot.urdf, joint_offsets.csv, ur_kinematics.yaml of a UR arm, joint corrections where there are any. Of
-    an identification also masses and friction, as URDF, MJCF, drives.csv and parameters.json. Each file is read back by
-    an independent reader before it is put in place. A result whose verdict is no pass is exported with a warning that
-    says why, which stands in the URDFs and a README.txt, too.
+    A fit is written as robot.urdf, joint_offsets.csv, ur_kinematics.yaml (UR arms) and joint corrections, if there are
+    any.
+    An identification is written with masses and friction, as URDF, MJCF, drives.csv and parameters.json. Each file is
+    verified by an independent reader before it is moved to its place. If the verdict is not pass, a warning with the
+    reason
+    is given, and written into the URDFs and README.txt.
 
     Args:
         result: a fit, an identification, or the folder of one.
         into: folder for the files.
-        urdf: description of the nominal robot to edit, everything else in it kept; by default the fit's own source.
-        prior: what masses that the torques do not identify are regularised towards, ``entropic`` or ``euclidean``.
-        ros2: name of a ROS 2 package that is written into the folder, in place of the other files
-            (``calib formats ros2``).
-        moveit: files of MoveIt to copy into that package, or a folder with them.
-        control: write a ros2_control for mock hardware into its URDF where there is none.
-        overwrite: replace files of that package that are there.
+        urdf: description of the nominal robot to edit, of which everything else is kept; None: the fit's own source.
+        prior: regularisation of masses that the torques do not identify, ``entropic`` or ``euclidean``.
+        ros2: name of a ROS 2 package to write into the folder instead of the other files (``calib formats ros2``);
+            empty:
+            no package.
+        moveit: MoveIt files, or a folder with them, to copy into the package.
+        control: whether to write a ros2_control for mock hardware into the package's URDF if it has none.
+        overwrite: whether to replace existing files of the package.
 
     Returns:
-        What was written and what to know of it, in words.
+        Remarks on the written files, as text.
 
     Raises:
-        RobotError: where a file does not read back as the robot; it is not written.
+        RobotError: if a file, read back, differs from the robot; it is not written.
     """
     settings = ExportSettings(optional(urdf), prior, ros2, tuple(map(Path, moveit)), control, overwrite)
     with saved(result) as folder:

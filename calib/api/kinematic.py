@@ -40,7 +40,7 @@ Several = Measured | Sequence[Measured | Sequence[Measured]]
 
 
 class PoseSelection(ChartedResult, Unjudged, selection.Chosen):
-    """Poses that determine a robot's geometry best. ``print`` shows index, bound and what random poses reach."""
+    """Poses that determine a robot's geometry best. ``print`` shows index, bound and the index of random poses."""
 
     kind = BY_NAME["selection"]
     tab = "q chain selection outlook run notes plot save save_run to_dict to_dataframe"
@@ -52,10 +52,16 @@ class PoseSelection(ChartedResult, Unjudged, selection.Chosen):
 
     @checked
     def save(self, path: str | Path, *, plots: bool = True, overwrite: bool = False) -> Path:
-        """Write the poses as CSV under the joints' names [deg or mm], and the predicted errors next to it.
+        """Write the poses as CSV with the joints' names [deg or mm], and the predicted errors next to it; return its
+        path.
 
-        That is ``…_prediction.json``, which a fit's ``selection`` takes, and the figures of `plot`. Files that no
-        earlier selection left, or that hold measurements since, are refused unless `overwrite`.
+        The prediction is ``…_prediction.json``, which the argument `poses` of `fit_geometry` uses; the figures are
+        those of
+        `plot`. Files that are not from an earlier selection, or to which measurements were added, are refused unless
+        `overwrite`.
+
+        Raises:
+            UsageError: for such files.
         """
         from calib.procedure.report.style import save
 
@@ -74,9 +80,10 @@ class PoseSelection(ChartedResult, Unjudged, selection.Chosen):
             return write_run(Path(path), self.run, self.chain)
 
     def charts(self) -> dict[str, Chart]:
-        """Return what the figures show: σ of the tool position over the workspace, and over the number of poses.
+        """Return the charts of the figures by name: σ of the tool position over the workspace, and over the number of
+        poses.
 
-        There are none where a parameter is not identifiable.
+        {} if a parameter is not identifiable.
         """
         from calib.procedure.report.geometry_figures import outlook_figure, predicted_map
 
@@ -135,19 +142,20 @@ class GeometryFit(ChartedResult, Judged, fit.Outcome):
 
     @property
     def estimate(self) -> Estimate:
-        """The fitted parameters [m, rad] with their covariance."""
+        """Return the results of the selection: index, value, value of random poses, efficiency, seconds, notes."""
         return self.selection.fit.estimate
 
     @one_blas_thread()
     def predict(self, q: object, tool: int = 0) -> PredictedPoses:
         """Return the tool poses of the calibrated robot at given joint values, in its base frame, with their σ.
 
-        σ of the position is all that is to be expected (`position_sigma`) where the fit states it, else that of the
-        parameters, as σ of the orientation is.
+        σ of the position contains all expected errors (`position_sigma`) if the fit has an error model, else only those
+        of the
+        parameters; σ of the orientation contains those of the parameters.
 
         Args:
             q: (m, n) joint values [rad or m].
-            tool: which of the fit's tools.
+            tool: index of the fit's tool.
         """
         geometry = self.selection.fit
         poses = self._poses(q)
@@ -161,15 +169,16 @@ class GeometryFit(ChartedResult, Judged, fit.Outcome):
     def position_sigma(self, q: object, tool: int = 0) -> np.ndarray:
         """Return the standard deviation (m,) [m] of the tool position error (norm over the axes) at given poses.
 
-        Parameters' covariance and unmodelled effects, estimated on held-out rows: it grows with the distance from the
-        poses of the fit. 95 % of errors are within ``expected.discrepancy.radius`` times that.
+        It contains the parameters' covariance and unmodelled effects, estimated on held-out rows, and grows with the
+        distance
+        from the fitted poses. 95 % of the errors are below ``expected.discrepancy.radius`` times this value.
 
         Args:
             q: (m, n) joint values [rad or m].
-            tool: which of the fit's tools.
+            tool: index of the fit's tool.
 
         Raises:
-            UsageError: where no positions were measured.
+            UsageError: if no positions were measured.
         """
         if self.expected is None:
             raise UsageError("this fit has no expected errors: they need at least 20 measured positions")
@@ -189,7 +198,7 @@ class GeometryFit(ChartedResult, Judged, fit.Outcome):
         return folder.write_folder(self, Path(out), partial(outputs.write_fit, plots=plots))
 
     def charts(self) -> dict[str, Chart]:
-        """Return what the figures of the report show, by name."""
+        """Return the charts of the report's figures by name."""
         from calib.procedure.report import geometry_figures
         from calib.procedure.report.fit_report import collect
 
@@ -231,21 +240,23 @@ def select_poses(
 ) -> PoseSelection:
     """Choose reachable, visible poses that determine a robot's geometry best.
 
-    With no file poses keep away from joint limits, from the arm itself and from the floor it stands on; what was not
-    checked is listed. ``SelectionSettings.without`` names what need not be kept.
+    By default, poses keep clear of joint limits, of the arm itself and of the floor that it stands on; the result lists
+    what was not checked. ``SelectionSettings.without`` names constraints to ignore.
 
     Args:
-        robot, base, tip: as of `calib.load`; or what it returned.
-        count: how many poses.
-        settings: what is measured, targets, index, method, sigmas, seed.
-        constraints: TOML file of where the arm may go, and where the instrument stands (``calib formats constraints``),
-            or its tables.
-        existing: poses measured before, which count: a CSV, measurements, or joint values (m, n) [rad or m].
-        workers: local processes, or the address of a Dask scheduler.
-        progress: called with a few words now and then.
+        robot, base, tip: arguments as of `calib.load`, or its result.
+        count: number of poses.
+        settings: measured quantity, targets, index, method, sigmas, seed.
+        constraints: TOML file of the arm's workspace and the instrument's placement (``calib formats constraints``), or
+            its tables; None: defaults.
+        existing: poses measured before, which the selection complements: a CSV, measurements, or joint values (m, n)
+            [rad
+            or m]; None: none.
+        workers: number of local processes, or the address of a Dask scheduler.
+        progress: called with texts on the progress; None: silent.
 
     Raises:
-        UsageError, RobotError: for input that cannot be right.
+        UsageError, RobotError: for invalid input.
     """
     from calib.workers import workers as opened
 
@@ -289,21 +300,23 @@ def fit_geometry(
     """Fit a robot's geometry to measured poses, and judge it on unseen poses.
 
     Args:
-        robot, base, tip: the nominal robot, as of `calib.load`; or what it returned. Of a parallel robot the result
-            has the same members; its measurements are files.
-        measured: CSV files, what `read_poses` returned, or several of either.
-        settings: model, loss, folds, stations, tools, rows to hold out, tolerance, seed.
-        validate: unseen poses, like `measured`.
-        options: what the files' headers do not say, priors, fixed parameters (``calib formats options``).
-        poses: what was measured, as `select_poses` returned it, the CSV that it was saved as, or its folder: the
-            σ that it predicted are compared with the fit's (finding ``sigma-ratio``).
-        on_read: called with what was read, before the fit begins.
-        progress: called with a few words now and then.
+        robot, base, tip: the nominal robot: arguments as of `calib.load`, or its result. For a parallel robot, the
+            result has the same members; its measurements are files.
+        measured: CSV files, results of `read_poses`, or several of either.
+        settings: model, loss, folds, stations, tools, rows to hold out, tolerance, seed; None: defaults.
+        validate: unseen poses, in the forms of `measured`.
+        options: units and columns that the files' headers do not state, priors, fixed parameters (``calib formats
+            options``).
+        poses: the planned poses: result of `select_poses`, its CSV, or its folder; its predicted σ are compared with
+            the
+            fit's (finding ``sigma-ratio``).
+        on_read: called with the inputs before the fit begins.
+        progress: called with the name of each step; None: silent.
 
     Raises:
-        MeasurementError: for files that cannot be right, naming row and column.
-        Unidentifiable: where no parameter is identifiable.
-        NotConverged: where the fit did not come to an end.
+        MeasurementError: for implausible files, naming row and column.
+        Unidentifiable: if no parameter is identifiable.
+        NotConverged: if the fit did not converge.
     """
     if not isinstance(options, FitOptions):
         options = read_options(optional(options))

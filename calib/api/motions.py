@@ -35,7 +35,9 @@ def _columns(track: Setpoints) -> Sampled:
 
 
 class ExcitationDesign(ChartedResult, Unjudged, design.Designed):
-    """A motion that excites a robot's dynamics, verified within limits. ``print`` shows condition numbers, margins."""
+    """A motion that excites a robot's dynamics, verified within limits. ``print`` shows condition numbers and
+    margins.
+    """
 
     kind = BY_NAME["excitation"]
     tab = "period condition goals proof outlook predicted front notes sampled plot save to_dict"
@@ -43,8 +45,9 @@ class ExcitationDesign(ChartedResult, Unjudged, design.Designed):
     def sampled(self, rate: float | None = None) -> Sampled:
         """Return t (N,) [s] and q, v, a (N, n) [rad or m, per s, per s²] of one period at `rate` [Hz], ends included.
 
-        Without `rate` the samples are those of the controller's rate that `save` writes; at any rate they are of the
-        series itself, nothing is interpolated.
+        Without `rate`, the samples are those at the controller's rate that `save` writes. Samples at any rate are
+        computed from
+        the motion's series, not interpolated.
         """
         return _columns(folder.one_period(self, rate))
 
@@ -57,13 +60,13 @@ class ExcitationDesign(ChartedResult, Unjudged, design.Designed):
         return folder.write_design(self, Path(out), write_figures)
 
     def charts(self) -> dict[str, Chart]:
-        """Return what the figures show: motion, tool path, search, front."""
+        """Return the charts of the figures by name: motion, tool path, search, front."""
         from calib.procedure.report import motion_figures
 
         return motion_figures.design_figures(self)
 
     def to_dict(self) -> dict[str, object]:
-        """Return the metrics as ``metrics.json`` holds them."""
+        """Return the metrics as in ``metrics.json``."""
         return folder.design_metrics(self)
 
     def __repr__(self) -> str:
@@ -97,13 +100,13 @@ class MotionPlan(ChartedResult, Unjudged, planning.Planned):
         return folder.write_plan(self, Path(out), write_figures)
 
     def charts(self) -> dict[str, Chart]:
-        """Return what the figures show: motion and speed profile."""
+        """Return the charts of the figures by name: motion and speed profile."""
         from calib.procedure.report import motion_figures
 
         return motion_figures.plan_figures(self)
 
     def to_dict(self) -> dict[str, object]:
-        """Return the metrics as ``metrics.json`` holds them."""
+        """Return the metrics as in ``metrics.json``."""
         return folder.plan_metrics(self)
 
     def __repr__(self) -> str:
@@ -136,21 +139,23 @@ def design_excitation(
     """Design a motion that excites a robot's dynamics within its limits.
 
     Args:
-        robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``. Of a parallel robot the result has
-            the same members but ``plot``.
+        robot, base, tip: arguments as of `calib.load`, its result, or ``fit.robot``. For a parallel robot, the result
+            has
+            the same members except ``plot``.
         settings: period, harmonics, goals, effort of the search, playback, seed.
-        model: identified dynamics, in memory or in a folder: they predict the torques.
+        model: identified dynamics that predict the torques, in memory or as a folder; None: the robot's description.
         limits: TOML file of speeds, torques, workspace, collision (``calib formats limits``), or its tables.
-        options: of the identification that will follow, as `calib.identify_dynamics` takes them: its torque rows, drive
-            terms, couplings and payloads are what the motion is designed for.
-        after: identified dynamics that the motion shall add to, in place of `model`: designed is what lowers their σ
-            most, and predicted how far.
-        workers: local processes, or the address of a Dask scheduler.
-        progress: called with a few words now and then.
+        options: settings of the identification that will follow, as of `calib.identify_dynamics`: the motion is
+            designed
+            for its torque rows, drive terms, couplings and payloads.
+        after: identified dynamics whose recordings the motion complements, instead of `model`: the motion that reduces
+            their σ most is designed, and the reduction is predicted.
+        workers: number of local processes, or the address of a Dask scheduler.
+        progress: called with texts on the progress; None: silent.
 
     Raises:
-        UsageError: for limits and goals that cannot be.
-        NothingFeasible: where no motion keeps the limits, naming the constraint.
+        UsageError: for impossible limits and goals.
+        NothingFeasible: if no motion keeps the limits, naming the constraint.
     """
     from calib.workers import workers as opened
 
@@ -203,15 +208,16 @@ def plan_motion(
     """Plan the fastest motion through waypoints, within a robot's speeds and torques.
 
     Args:
-        robot, base, tip: as of `calib.load`; or what it returned; or ``fit.robot``. Of a parallel robot the result has
-            the same members but ``plot``.
-        waypoints: CSV of joint values, or of places of the tip (of the platform's coordinates); or arrays: joint values
+        robot, base, tip: arguments as of `calib.load`, its result, or ``fit.robot``. For a parallel robot, the result
+            has
+            the same members except ``plot``.
+        waypoints: CSV of joint values, or of poses of the tip (of the platform's coordinates); or arrays: joint values
             (m, n) [rad or m], poses of the tip (m, 4, 4) [m].
         settings: payloads, straight lines, rate, shaping, approach.
-        model: identified dynamics, in memory or in a folder, to plan with.
-        limits: TOML file (``calib formats limits``); drives: TOML file of Ia, Fv, Fc, off, where there is no model;
-            or the tables of either.
-        progress: called with a few words now and then.
+        model: identified dynamics, in memory or as a folder; None: the robot's description.
+        limits: TOML file (``calib formats limits``), or its tables.
+        drives: TOML file of Ia, Fv, Fc, off, or its tables, without a model.
+        progress: called with texts on the progress; None: silent.
 
     Raises:
         UsageError: for waypoints that cannot be reached, and limits that cannot be kept.

@@ -22,17 +22,17 @@ def load(robot: str | Path, *, base: str | None = None, tip: str | None = None) 
 
     Args:
         robot: a ``.urdf``, an MDH table in TOML, a library name (``lwr4plus tx40 rv2sq ur5 ur10 ur10e panda iiwa14``),
-            or the folder of an earlier fit, whose nominal robot, covariance and joint corrections come along. Of a
-            parallel robot (``dualv fivebar stewart``, or a TOML of legs) the result is a
-            `calib.procedure.robot_kinds.Mechanism`, which the verbs take likewise.
-        base, tip: links of a URDF between which the arm runs; by default from the root to
-            the flange (`calib.robot.formats.arm_ends`); ``print`` says which link that is, and why.
+            or the folder of an earlier fit, with its nominal robot, covariance and joint corrections. For a parallel
+            robot (``dualv fivebar stewart``, or a TOML of legs) the result is a
+            `calib.procedure.robot_kinds.Mechanism`, which the other API functions accept, too.
+        base, tip: first and last link of the arm in a URDF; None: the root, and the flange
+            (`calib.robot.formats.arm_ends`); ``print`` names the chosen link and the reason.
 
     Returns:
-        The robot; without a fit behind it, its ``nominal``, ``covariance`` and ``corrections`` are None.
+        The robot; if it does not come from a fit, its ``nominal``, ``covariance`` and ``corrections`` are None.
 
     Raises:
-        RobotError: where nothing of this kind is found, or the file is wrong: with place and advice.
+        RobotError: if nothing of this kind is found, or the file is wrong, with its line and advice.
     """
     if stage_of(robot, "identify", base, tip) is not None:
         return cast(CalibratedChain, mechanism(robot))
@@ -47,8 +47,8 @@ def read_poses(
 
     Args:
         path: the file; its columns and units: ``calib formats measurements``.
-        robot: whose joints the columns name, as `load` takes or returns it.
-        options: what the header does not say, or the TOML file that says it (``calib formats options``).
+        robot: robot whose joints the columns name, as `load` takes or returns it.
+        options: units and columns that the header does not state, or a TOML file with them (``calib formats options``).
 
     Returns:
         One block per kind of measurement and station, joints [rad, m], lengths [m].
@@ -71,8 +71,9 @@ def read_recording(
 
     Args:
         path: the file; ``log.npz@0:9.4`` cuts out seconds 0 to 9.4.
-        robot: whose joints are logged, as `load` takes or returns it.
-        options: what the file does not say, `calib.data.recordings.recording_options.RecordingOptions`.
+        robot: robot whose joints are logged, as `load` takes or returns it.
+        options: units and columns that the file does not state, see
+            `calib.data.recordings.recording_options.RecordingOptions`; None: defaults.
 
     Raises:
         MeasurementError: naming file, row, column and the likely cause.

@@ -1,7 +1,7 @@
 """Base classes of results in memory: console text for ``print(result)``, and a page for notebooks.
 
-And helpers for arguments of the verbs that have several forms: one or many, a file that may be missing, a result or its
-folder.
+Also helpers for arguments of the API functions that have several forms: a single value or several, an optional file, a
+result or its folder.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class SavedResult(Protocol):
     """A result that can be written to a folder."""
 
     def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
-        """Write the result's folder."""
+        """Write the result's folder, and return its path."""
         ...
 
 
@@ -78,7 +78,7 @@ def saved(result: str | Path | SavedResult) -> Iterator[Path]:
 
 
 def _renamed(argument: object, path: str, name: str) -> object:
-    """Return an error's argument with a path in its text replaced by a name."""
+    """Return an error's argument; in a text, the path is replaced by a name."""
     if isinstance(argument, str):
         return argument.replace(path, name)
     return argument
@@ -95,7 +95,7 @@ def as_text(renderables: Iterable[object]) -> str:
 
 
 class Shown:
-    """A result that a notebook shows as ``print`` does, with the members in `tab` on Tab."""
+    """A result that notebooks show like ``print``; completion by Tab lists the members in `tab`."""
 
     tab: ClassVar[str] = ""
 
@@ -107,7 +107,7 @@ class Shown:
 
 
 class Kept(Shown, ABC):
-    """A result that is written to a folder, and a `calib.Result`: what its folder holds it reads there.
+    """A result in memory that can be written to a folder and fulfils `calib.Result` by reading this folder.
 
     Attributes:
         kind: one of `calib.result_kinds.KINDS`.
@@ -117,24 +117,24 @@ class Kept(Shown, ABC):
 
     @abstractmethod
     def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
-        """Write the result's folder."""
+        """Write the result's folder, and return its path."""
 
     def figures(self) -> Mapping[str, Picture]:
         """Return the figures by name, as PNG."""
         return {}
 
     def tables(self) -> Mapping[str, Table]:
-        """Return the tables by name, as the files that `save` writes hold them."""
+        """Return the tables by name, as in the files that `save` writes."""
         from calib.results.registry import open_result
 
         with saved(self) as folder:
             return open_result(folder).tables()
 
     def scene(self, robot: str | None = None) -> Scene:
-        """Return what the viewer draws: robot, poses, motions, torques.
+        """Return the scene that the viewer draws: robot, poses, motions, torques.
 
         Args:
-            robot: the robot to draw; None for the result's.
+            robot: name or file of the robot to draw; None: the result's robot.
         """
         from calib.results.registry import open_result
 
@@ -143,11 +143,11 @@ class Kept(Shown, ABC):
 
 
 class Unjudged(Kept):
-    """A result that keeps what was asked of it, and has no verdict."""
+    """A result, such as a motion, that has no verdict."""
 
     @property
     def verdict(self) -> Verdict:
-        """Not judged."""
+        """The verdict with the level `NOT_JUDGED`."""
         return Verdict(NOT_JUDGED, f"{self.kind.noun} has no verdict")
 
 
@@ -162,7 +162,7 @@ class ChartedResult(Kept):
 
     @abstractmethod
     def charts(self) -> Mapping[str, Chart]:
-        """Return what the figures show, by name."""
+        """Return the charts of the figures by name."""
 
     @overload
     def plot(self) -> dict[str, Figure]: ...
@@ -170,7 +170,7 @@ class ChartedResult(Kept):
     def plot(self, name: str) -> Figure: ...
     @one_blas_thread()
     def plot(self, name: str | None = None) -> Any:
-        """Return one of the figures, or all of them by name."""
+        """Return the figure of this name; for None, all figures by name."""
         from calib.procedure.report import charts
 
         charts_by_name = self.charts()
@@ -181,7 +181,7 @@ class ChartedResult(Kept):
 
 
 class Judged(Kept):
-    """A result shown as a section of a report: on a console, by ``print``, and as a page in a notebook."""
+    """A result with a verdict, shown as a section of a report: by ``print``, and as a page in a notebook."""
 
     @abstractmethod
     def section(self) -> Section:
@@ -218,10 +218,10 @@ class Judged(Kept):
 
 
 def data_frame(rows: Iterable[object], columns: Sequence[str]) -> DataFrame:
-    """Return rows as a pandas DataFrame.
+    """Return rows as a pandas DataFrame with these columns.
 
     Raises:
-        UsageError: where pandas is not installed.
+        UsageError: if pandas is not installed.
     """
     message = "data frames need pandas: pip install 'armature-calib[pandas]'; to_dict() and save() do without"
     with refused_as(UsageError, ImportError, message):

@@ -129,7 +129,7 @@ def run(arguments: list[str] | None = None) -> int:
 
 
 def _failed(error: Exception, arguments: list[str]) -> int:
-    """Print the error, and return its exit code."""
+    """Print the error, write a bug report if it is internal, and return its exit code."""
     from calib import bug_reports
     from calib.errors import complaint
 
@@ -143,7 +143,7 @@ def _failed(error: Exception, arguments: list[str]) -> int:
 def _spread(arguments: list[str]) -> list[str]:
     """Return the arguments with ``--validate a b`` expanded to ``--validate a --validate b``.
 
-    Only where ROBOT and MEASURED have come before: what follows --validate then cannot be one of them.
+    They are expanded only after ROBOT and MEASURED, since texts after --validate could be these arguments otherwise.
     """
     commands = [argument for argument in arguments[:2] if argument in ("fit", "identify", "compare")]
     if not commands:

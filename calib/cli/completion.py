@@ -1,4 +1,4 @@
-"""What the shell completes: robots of the library, topics, codes. Loads nothing heavy: Tab must answer at once."""
+"""Shell completion: robots of the library, topics, codes. Loads no heavy module, since completion must be fast."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -10,7 +10,7 @@ from calib.config_types import OneOf
 
 
 def robots(incomplete: str) -> Iterator[str]:
-    """Yield the library's robots that begin with what is typed, and then files and folders that do, too."""
+    """Yield the library's robots whose names begin with the text typed so far, then such files and folders."""
     from calib.procedure.robot_kinds import ROBOTS
 
     folders = [Path(__file__).parents[1] / "robot" / "library"]
@@ -34,7 +34,7 @@ def topics() -> list[tuple[str, str]]:
 
 
 def codes() -> list[str]:
-    """Return the findings' codes, and the terms in one word, that `calib explain` knows."""
+    """Return the codes of findings, and the one-word terms, that `calib explain` knows."""
     from calib.procedure.findings import catalogue, glossary
 
     terms = [term for term in glossary() if " " not in term]

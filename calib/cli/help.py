@@ -1,4 +1,4 @@
-"""Help of the commands as a user reads it: commands in groups, arguments in capitals, plain words for types."""
+"""Help of the commands: commands in groups, arguments in capitals, plain words for types."""
 
 import sys
 import unicodedata
@@ -19,10 +19,11 @@ _WORDS = {int: "N", float: "NUMBER", Path: "PATH"}
 
 
 def type_word(kind: object, choices: tuple[str, ...] | str = ()) -> str | None:
-    """Return what stands behind an option's name for its value: the choices where they are short; None for a flag.
+    """Return the text after an option's name for its value: the choices if they are short; None for a flag.
 
     Args:
-        choices: the allowed texts; or where they are to be found, for a module that is loaded late.
+        kind: type of the option's value.
+        choices: the allowed texts; or the module attribute that lists them, for a module that is loaded late.
     """
     if get_origin(kind) is list:
         kind = get_args(kind)[0]
@@ -36,7 +37,7 @@ def type_word(kind: object, choices: tuple[str, ...] | str = ()) -> str | None:
 
 
 class _Spelt(_ClickCommand):
-    """Help in letters that the console has, which Typer would write as UTF-8 all the same."""
+    """Help text converted to characters that the console can print; Typer would always write UTF-8."""
 
     def get_help(self, ctx: Any) -> str:
         console = sys.stdout.encoding or "utf-8"
@@ -63,7 +64,7 @@ class Command(_Spelt, TyperCommand):
 
 
 class CommandGroup(_Spelt, TyperGroup):
-    """The list of commands in `GROUPS`, each stated where the command is (`calib.cli.shared.command`)."""
+    """The list of commands by `GROUPS`; each command states its group in its decorator (`calib.cli.shared.command`)."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         groups: dict[str, list[tuple[str, str]]] = {title: [] for title in GROUPS}
@@ -76,7 +77,9 @@ class CommandGroup(_Spelt, TyperGroup):
 
 
 def spelt(error: Any) -> tuple[str, int]:
-    """Return letters that an encoding lacks in ASCII (sigma, ^2, ...), or by their number; see `codecs`."""
+    """Return ASCII replacements (sigma, ^2, ...) for characters that an encoding lacks, else their number; see
+    `codecs`.
+    """
     letters = error.object[error.start : error.end]
     return "".join(map(_in_ascii, letters)), error.end
 

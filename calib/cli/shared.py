@@ -37,9 +37,10 @@ def check_destination(verb: str, robot: object, out: Path, inputs: Sequence[str 
     """Raise an error, before any work is done, if the command `verb` must not write its results to the folder `out`.
 
     Args:
-        robot: a serial arm or another robot, as a person names it.
-        out: where results are to go.
-        inputs: what is read; none of it is written over.
+        verb: name of the command.
+        robot: a serial arm or another robot, as named by the user.
+        out: folder for the results.
+        inputs: files that the command reads, which must not be overwritten; None: no file.
 
     Raises:
         UsageError: with the file or folder concerned.
@@ -124,7 +125,7 @@ _OUTPUT: ContextVar[_Output | None] = ContextVar("output", default=None)
 
 
 class _Logged(logging.Handler):
-    """Prints what the package logs for the user, each text once."""
+    """Log handler that prints the package's messages to the user, each text once."""
 
     def __init__(self) -> None:
         super().__init__(logging.INFO)
@@ -139,9 +140,9 @@ class _Logged(logging.Handler):
 
 @contextmanager
 def printing(verbose: bool) -> Iterator[None]:
-    """Print the lines that the block gives to `say`: all if `verbose`, otherwise the most important ones.
+    """Print the lines that the block passes to `say`: all if `verbose`, otherwise the most important ones.
 
-    What the package logs is printed among them.
+    Messages that the package logs are printed, too.
     """
     output = _Output(verbose)
     log = logging.getLogger("calib")
@@ -171,7 +172,7 @@ def say_written(lines: Iterable[object], out: Path, verdict: str = "") -> None:
     """Print the lines of a result and the path that it was written to.
 
     Raises:
-        typer.Exit: with code 1 where the verdict is fail.
+        typer.Exit: with code 1 if the verdict is fail.
     """
     say(*lines, f"written to {out}")
     exit_failed(verdict)
@@ -217,7 +218,8 @@ def reporting(logged: float = inf) -> Iterator[tuple[Callable[..., None], Callab
     """Yield two functions: one for permanent lines, one for progress messages.
 
     Args:
-        logged: seconds between such words on stderr where the output is no terminal, but a file or a job's log.
+        logged: interval [s] between progress messages on stderr if the output is not a terminal, but a file or a job's
+            log.
     """
     console = make_console()
     if not console.is_terminal and logged < inf:
@@ -228,7 +230,7 @@ def reporting(logged: float = inf) -> Iterator[tuple[Callable[..., None], Callab
 
 
 def numbers(text: str, count: int, option: str) -> list[float]:
-    """Return the `count` finite numbers of an option's text, ``1,2,3``."""
+    """Return the `count` finite numbers of an option's text ``1,2,3``; refuse any other text with a UsageError."""
     try:
         values = [plain_number(part) for part in text.split(",")]
     except ValueError:

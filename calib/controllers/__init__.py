@@ -1,1 +1,1 @@
-"""Robot controllers: what each shows, and what it can be told."""
+"""Robot controllers: what each displays, and which programs and settings it accepts."""

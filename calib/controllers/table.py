@@ -1,8 +1,8 @@
-"""Robot controllers, as ``controllers.toml`` declares them: their joints, their programs, what they can be told.
+"""Robot controllers, as declared in ``controllers.toml``: joint values, programs, accepted settings.
 
-A controller shows  s_i = sign_i · (q_i + Σ way · q_j)  for a description's joints q: signs and coupled axes (a
-FANUC's J3 counts from the horizontal). Descriptions are ROS-Industrial's or the maker's; where a description counts a
-joint from another zero, its programs would be wrong: play them in the controller's simulation first.
+A controller displays  s_i = sign_i · (q_i + Σ way · q_j)  for a description's joints q: signs and coupled axes (a
+FANUC's J3 is measured from the horizontal). Descriptions are ROS-Industrial's or the maker's. If a description has
+another zero of a joint, the programs would be wrong: play them in the controller's simulation first.
 """
 
 import tomllib
@@ -22,7 +22,7 @@ from calib.units import ANGLES, LENGTHS
 @strict
 @dataclass(frozen=True)
 class Controller:
-    """One entry of ``controllers.toml``; what each key means stands at the head of that file."""
+    """One entry of ``controllers.toml``; the head of that file explains each key."""
 
     title: str
     files: Mapping[str, str]
@@ -61,7 +61,7 @@ class Controller:
     comment: str = ""
 
     def matrix(self, n: int) -> np.ndarray:
-        """Return the matrix (n, n) from a description's joints to those that the controller shows."""
+        """Return the matrix (n, n) from a description's joints to the joints that the controller displays."""
         coupling = np.eye(n)
         for axis, partner, sign in self.coupled:
             if max(axis, partner) <= n:
@@ -69,11 +69,13 @@ class Controller:
         return np.array(self.signs or [1] * n)[:, None] * coupling
 
     def shown(self, q: np.ndarray) -> np.ndarray:
-        """Return the joints (…, n) [rad] of a description as the controller shows them, in its unit."""
+        """Return a description's joint values (…, n) [rad] as the controller displays them, in its unit."""
         return q @ self.matrix(q.shape[-1]).T / ANGLES[self.unit]
 
     def described(self, controller_values: np.ndarray) -> np.ndarray:
-        """Return the joints (…, n) of a description from those that the controller shows, in the same unit."""
+        """Return a description's joint values (…, n) from those that the controller displays, in the controller's
+        unit.
+        """
         return controller_values @ np.linalg.inv(self.matrix(controller_values.shape[-1])).T
 
     @property
@@ -99,13 +101,13 @@ def controller_named(name: str) -> Controller:
     """Return a controller by its name.
 
     Raises:
-        UsageError: for an unknown name, with the known ones.
+        UsageError: for an unknown name; the message lists the known names.
     """
     return controllers()[one_of(name, controllers(), "controller", UsageError)]
 
 
 def check_controller(name: str, axes: int, pulses: Sequence[float] = ()) -> None:
-    """Refuse an unknown name, a controller that takes no arm of so many axes, and one whose pulses are not given."""
+    """Raise a UsageError for an unknown name, an arm with another number of axes, or missing pulses per axis."""
     controller = controller_named(name)
     allowed = " or ".join(map(str, controller.axes))
     require(not allowed or axes in controller.axes, f"{axes} joints; {controller.title} takes {allowed}", UsageError)
@@ -114,10 +116,10 @@ def check_controller(name: str, axes: int, pulses: Sequence[float] = ()) -> None
 
 
 def controller_of(path: Path, name: str = "") -> Controller:
-    """Return the controller whose program stands at `path`: by name, or by the file's suffix.
+    """Return the controller of a program at `path`: by `name`, or, if it is empty, by the file's suffix.
 
     Raises:
-        UsageError: where no controller's programs whose targets are read end so.
+        UsageError: if no controller's programs have this suffix and targets that can be read.
     """
     if name:
         return controller_named(name)
@@ -129,10 +131,10 @@ def controller_of(path: Path, name: str = "") -> Controller:
 
 
 def as_described(name: str, controller_values: np.ndarray) -> np.ndarray:
-    """Return a description's joints, or their speeds (…, n), from those that a controller shows, in the same unit."""
+    """Return a description's joint values or speeds (…, n) from those that a controller displays, in the same unit."""
     return controller_named(name).described(controller_values)
 
 
 def motors_as_described(name: str, controller_values: np.ndarray) -> np.ndarray:
-    """Return motors' torques or currents (…, n) with the description's signs; coupled axes do not change a motor."""
+    """Return motor torques or currents (…, n) with the description's signs; coupled axes do not affect them."""
     return controller_values * np.array(controller_named(name).signs or 1.0)

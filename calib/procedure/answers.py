@@ -125,5 +125,5 @@ class Answers:
 
     @property
     def cell(self) -> dict[str, str | tuple[str, ...]]:
-        """The answers that describe the cell: option name -> answer."""
+        """Answers about the measuring cell: option name -> answer; questions without an answer are absent."""
         return {name: value for name in CELL if (value := getattr(self, name)) is not None}

@@ -1,14 +1,15 @@
 """Findings as sentences, and verdicts from findings: all sentences and limits are in ``findings.toml``.
 
-A stage makes values, ``finding("moved", times=…)`` (`calib.errors.Finding`). The catalogue has for each code
+A stage creates findings, ``finding("moved", times=…)`` (`calib.errors.Finding`). For each code, the catalogue states
 
     says     the sentence, number first; ``{rms:.3g mm}`` prints a value [SI] in a unit, ``{names:5}`` five of many,
-             ``<, …>`` a part that is left out where one of its values is None or empty
+             ``<, …>`` an optional part, omitted if one of its values is None or empty
     advice   what to do
     level    note, marginal or fail; or
-    limits   value -> level -> above what it holds: the mildest of several values' counts, none of them: nothing is said
-    accept   the name in the options' ``accept`` that lets a verdict pass
-    means    what `calib explain` says besides
+    limits   value -> level -> limit above which the value reaches the level; of several values the mildest level
+             counts; a finding that reaches no level is not reported
+    accept   the name in the options' ``accept`` by which a user accepts the finding
+    means    additional explanation of `calib explain`
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ OMITTED_VALUES = (None, "", (), [], False)
 class Verdict:
     """Verdict on a result: one of `LEVELS`, the reason in one sentence, the code of the deciding finding, and advice.
 
-    It equals the name of its level: ``fit.verdict == "pass"``.
+    A verdict compares equal to the name of its level: ``fit.verdict == "pass"``.
     """
 
     level: str
@@ -71,7 +72,7 @@ class Verdict:
         return cls(level_of(worst), "; ".join(parts), worst.code, advice)
 
     def for_prediction(self, reason: str) -> Verdict:
-        """Return the verdict of a model that cannot be exported for the reason `why`: pass becomes prediction only."""
+        """Return the verdict of a model that cannot be exported for the given reason: pass becomes prediction only."""
         if self.level != "pass":
             return self
         return Verdict(PREDICTION_ONLY, f"{self.reason}; {reason}")
@@ -85,8 +86,9 @@ class Verdicts:
     """Verdicts on the stages and deliverables of one robot.
 
     Attributes:
-        stages: ``geometry``, ``dynamics`` → the verdict on what is to be delivered.
-        deliverables: of the geometry: ``urdf`` and ``corrections`` → the verdict on it; empty if there is only one.
+        stages: name of a stage (``geometry``, ``dynamics``) → verdict on its result.
+        deliverables: ``urdf`` and ``corrections`` → verdict on this deliverable of the geometry; empty if there is only
+            one.
     """
 
     stages: Mapping[str, Verdict] = field(default_factory=dict)
@@ -99,7 +101,7 @@ class Verdicts:
         return max(stage_levels, key=LEVELS.index, default="")
 
     def of(self, deliverable: str, dynamics: bool = False) -> Verdicts:
-        """Return the verdicts that concern one deliverable, with or without the dynamics."""
+        """Return the verdicts that apply to one deliverable, with or without the verdict on the dynamics."""
         stages = {name: verdict for name, verdict in self.stages.items() if dynamics or name != "dynamics"}
         if deliverable in self.deliverables:
             stages["geometry"] = self.deliverables[deliverable]
@@ -173,7 +175,7 @@ def limit(code: str, value: str, level: str = "fail") -> float:
 
 
 def settle(findings: Iterable[Finding], accepted: Collection[str] = ()) -> tuple[Finding, ...]:
-    """Return the findings that reach a level, worst first, with those marked that the options accept."""
+    """Return the findings that reach a level, worst first; those that the options accept are marked as accepted."""
     marked = []
     for finding in findings:
         is_accepted = catalogue()[finding.code].accept in accepted
@@ -191,7 +193,9 @@ def sentence(finding: Finding) -> str:
 
 @dataclass(frozen=True)
 class Note:
-    """A line for the user; a warning is of a finding that prevents the verdict pass, and commands always print it."""
+    """A line for the user; `is_warning`: its finding prevents the verdict pass, so that commands always print the
+    line.
+    """
 
     text: str
     is_warning: bool = False
@@ -237,7 +241,7 @@ def glossary() -> Mapping[str, str]:
 
 
 def levels(entry: CatalogueEntry) -> str:
-    """Return in words what level a finding has, and from which values on; a limit below zero is exceeded always."""
+    """Return as text the levels of a catalogue entry and their limits; a limit below zero is always exceeded."""
     rules = []
     for value, limits in entry.limits.items():
         for level, limit in limits.items():
@@ -252,7 +256,7 @@ def explain(code: str) -> str:
     """Return the explanation of a finding's code (sentence, limits, advice) or of a term of the glossary.
 
     Raises:
-        UsageError: for a code or term that there is none of.
+        UsageError: for an unknown code or term.
     """
     terms = {term.lower(): f"{term}\n  {meaning}" for term, meaning in glossary().items()}
     entry = catalogue().get(code)
@@ -270,9 +274,9 @@ def explain(code: str) -> str:
 
 
 def in_words(template: str) -> str:
-    """Return a template to read: names of values in capitals with their units, parts that may be left out in brackets.
+    """Return a sentence template for reading: values as capitals with their units, optional parts in brackets.
 
-    ``{rms:.3g mm} remain<, {rival} too>`` is ``RMS mm remain[, RIVAL too]``.
+    ``{rms:.3g mm} remain<, {rival} too>`` becomes ``RMS mm remain[, RIVAL too]``.
     """
     words = []
     for text, name, format_spec, _ in Formatter().parse(template):
@@ -285,14 +289,14 @@ def in_words(template: str) -> str:
 
 
 def _with_unit(text: str, unit: str) -> str:
-    """Return a printed value followed by its unit; a degree sign stands without a space."""
+    """Return a printed value followed by its unit, with a space except before a degree sign."""
     if unit in ("", "°"):
         return text + unit
     return f"{text} {unit}"
 
 
 def _filled(template: str, values: Mapping[str, object]) -> str:
-    """Return a template with values inserted; an optional part ``<…>`` is left out if its value is None or empty."""
+    """Return a template with values inserted; an optional part ``<…>`` is omitted if its value is None or empty."""
 
     def part(match: re.Match[str]) -> str:
         for _, name, _, _ in Formatter().parse(match[1]):

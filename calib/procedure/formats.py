@@ -92,7 +92,7 @@ def describe(topic: str) -> str:
     """Return the documentation of the format `topic`.
 
     Raises:
-        UsageError: for an unknown topic, with the known ones.
+        UsageError: for an unknown topic; the message lists the known topics.
     """
     one_of(topic, TOPICS, "format", UsageError)
     _, modules = TOPICS[topic]
@@ -118,7 +118,7 @@ def json_schema(topic: str) -> str:
     """Return the JSON schema (draft 2020-12) of a kind of TOML file; editors use it to complete and check keys.
 
     Raises:
-        UsageError: for a topic without one, with those that have one.
+        UsageError: for a topic without a schema; the message lists the topics that have one.
     """
     if topic not in SCHEMAS:
         raise UsageError(f"no JSON schema for '{topic}'; available for {', '.join(SCHEMAS)}")
@@ -131,7 +131,7 @@ def _schema(topic: str) -> ParsedTable:
 
 
 def keys(topic: str) -> Iterator[tuple[str, str, str, str]]:
-    """Yield place (``sigma.position``), allowed values, default and meaning of each key of a kind of TOML file."""
+    """Yield path (``sigma.position``), allowed values, default and meaning of each key of a kind of TOML file."""
     table = _schema(topic)
     return _keys(table, table.get("$defs", {}))
 

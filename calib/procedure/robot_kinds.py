@@ -22,14 +22,14 @@ class RobotKind(Protocol):
 
     Attributes:
         KIND: `Mechanism.kind` of its robots.
-        LIBRARY: folder of those that go by a name.
+        LIBRARY: folder with the robots that can be named without a file.
     """
 
     KIND: str
     LIBRARY: Path
 
     def find(self, robot: object) -> Mechanism | None:
-        """Return the robot that a person names; None where it is none of this kind."""
+        """Return the robot that a name, file or object describes; None if it is not of this kind."""
         ...
 
     def stages(self) -> Mapping[str, CommandStage]:
@@ -71,9 +71,9 @@ class Mechanism(Protocol):
     """Robot that is not a serial arm, found by a `RobotKind`.
 
     Attributes:
-        kind: what it is, in words: ``parallel robot``.
-        source: the file it came from.
-        chain: its actuated joints as those of an arm: name, n, joint_names, joints.
+        kind: name of the kind: ``parallel robot``.
+        source: file that it was read from.
+        chain: its actuated joints in the form of an arm's: name, n, joint_names, joints.
         instead: command that it does not support → advice, as a clause.
     """
 

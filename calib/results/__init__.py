@@ -1,1 +1,1 @@
-"""Results read again from where commands wrote them: one protocol for all kinds, and what the viewer draws of them."""
+"""Results read from the folders or files that commands wrote: one protocol for all kinds, and scenes for the viewer."""

@@ -1,4 +1,4 @@
-"""Calibrated robots in their folders: fits, identifications, descriptions made from them, sessions."""
+"""Calibrated robots in their folders: fits, identifications, their exports, sessions."""
 
 from __future__ import annotations
 
@@ -37,7 +37,9 @@ class CalibratedRobot(Viewed):
         stage_of(self.path, verb)
 
     def export(self, into: Path, settings: ExportSettings) -> Exported:
-        """Write the robot for other programs: all files into a folder, or a ROS 2 package below it."""
+        """Write the robot for other programs: all files into the folder `into`, or a ROS 2 package below it; return
+        remarks.
+        """
         stage = stage_of(self.path, "export")
         if stage is not None:
             message = f"ros2 {settings.ros2}: a package is written of serial arms only"
@@ -62,7 +64,7 @@ class CalibratedRobot(Viewed):
         return Exported(delivery.mark(into, self.verdicts), lines)
 
     def _export_sources(self, settings: ExportSettings) -> delivery.Export:
-        """Return what an export reads: the fit, and the description that it was made from where none is given."""
+        """Return the sources of an export: the fit, and the nominal description (if not stated, the one of the fit)."""
         if settings.urdf is not None:
             return delivery.Export(settings.urdf, self.path)
         source = geometry.read(self.path).source
@@ -71,7 +73,7 @@ class CalibratedRobot(Viewed):
             return delivery.Export(resolve(source), self.path)
 
     def _refuse_in_session(self) -> None:
-        """Refuse a certificate of a session's step: the session has one."""
+        """Refuse to write a certificate for a step of a session, since the session has its own."""
         folder = self.path
         redo = command_line("redo", folder.parent, "certificate")
         words = f"{folder} belongs to a session, which has the certificate: {redo}"
@@ -99,7 +101,7 @@ class StoredFit(CalibratedRobot):
         return FitFolder(self.path)
 
     def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
-        """Return certificate and report."""
+        """Return certificate and report of the fit."""
         self._refuse_in_session()
         if not FitFolder(self.path).report.exists():
             self.refuse("certificate")
@@ -107,7 +109,7 @@ class StoredFit(CalibratedRobot):
 
 
 class StoredIdentification(CalibratedRobot):
-    """Identified dynamics, with the geometry that they stand on."""
+    """Identified dynamics, with the geometry that they were identified on."""
 
     kind = BY_NAME["identification"]
 
@@ -128,13 +130,13 @@ class StoredIdentification(CalibratedRobot):
         return delivery.Export(settings.urdf, identified=self.path, prior=settings.prior)
 
     def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
-        """Return certificate and report."""
+        """Return certificate and report of the identification."""
         self._refuse_in_session()
         return certificates.read_model(self.path, plots, details)
 
 
 class StoredSession(Viewed):
-    """A session, with the calibrations that its steps have come to."""
+    """A session, with the fit and the identification that its steps have completed."""
 
     kind = BY_NAME["session"]
 
@@ -152,12 +154,12 @@ class StoredSession(Viewed):
 
     @property
     def finished(self) -> bool:
-        """Whether the session has come to a verdict."""
+        """Whether the session has a verdict."""
         return self.session.concluded
 
     @property
     def verdict(self) -> Verdict:
-        """The worst of its stages' verdicts."""
+        """The worst verdict of the session's stages."""
         verdicts = self.verdicts
         if not verdicts.level:
             return Verdict(NOT_JUDGED, f"no verdict yet: {command_line('next', self.path)}")
@@ -197,7 +199,7 @@ class StoredSession(Viewed):
         return tables
 
     def _calibrations(self) -> list[StoredResult]:
-        """Return the fit and the identification, as far as the session has come."""
+        """Return the fit and the identification as far as the session has completed them."""
         results: list[StoredResult] = []
         if self.fit is not None:
             results.append(StoredFit(self.fit.path))

@@ -1,4 +1,4 @@
-"""The kinds of results, each registered once, and `open_result`, which opens what a person names."""
+"""The kinds of results, each registered once, and `open_result`, which opens the result at a path."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ PICTURE_SUFFIX = ".png"
 
 
 class StoredMotion(Viewed):
-    """A motion to play."""
+    """A designed or planned motion."""
 
     def motion(self) -> Path:
-        """Return the file to play: the whole run where there is one."""
+        """Return the file to play: the whole run if there is one, else the motion."""
         for name in (RUN, PLANNED, SAMPLES):
             path = self.path / name
             if path.is_file():
@@ -33,33 +33,33 @@ class StoredMotion(Viewed):
 
 
 class StoredExcitation(StoredMotion):
-    """A motion of `calib excite`."""
+    """A designed motion of `calib excite`."""
 
     kind = BY_NAME["excitation"]
 
 
 class StoredPlan(StoredMotion):
-    """A motion of `calib plan`."""
+    """A planned motion of `calib plan`."""
 
     kind = BY_NAME["plan"]
 
 
 class StoredFile(StoredResult):
-    """A result that is a file, with others beside it."""
+    """A result that is a file, possibly with accompanying files next to it."""
 
     def beside(self) -> list[Path]:
-        """Return the files that belong to it."""
+        """Return the files next to the file that belong to it."""
         return []
 
     def tables(self) -> dict[str, Table]:
-        """Return the table of a CSV file."""
+        """Return the table of a CSV file by its name; {} for other files."""
         return {self.path.stem: read_table(self.path)} if self.path.suffix == ".csv" else {}
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Copy the file, and those beside it under its new name; without figures where `plots` is False.
+        """Copy the file, and its accompanying files under the new name; without figures if `plots` is False.
 
         Raises:
-            UsageError: where one of them is there.
+            UsageError: if a file with one of the names exists.
         """
         out = Path(out)
         copies = {self.path: out}
@@ -79,7 +79,7 @@ class StoredSelection(StoredFile):
     kind = BY_NAME["selection"]
 
     def beside(self) -> list[Path]:
-        """Return prediction and figures."""
+        """Return the files of prediction and figures next to the CSV."""
         start = self.path.with_suffix("")
         return [Path(f"{start}{self.kind.companion}"), *sorted(start.parent.glob(f"{start.name}_*{PICTURE_SUFFIX}"))]
 
@@ -90,56 +90,56 @@ class StoredSelection(StoredFile):
         return {path.stem.removeprefix(start): Picture(path.read_bytes(), "") for path in paths}
 
     def scene(self, robot: str | None = None) -> Scene:
-        """Return the poses, of a robot that has to be named."""
+        """Return the poses to draw; the robot has to be named."""
         from calib.results import scene_files
 
         return scene_files.read(self.path, robot)
 
 
 class StoredRecall(StoredFile):
-    """One averaged period of a played motion: an archive of arrays, a recording to identify from."""
+    """One averaged period of a played motion: an archive of arrays, which `calib identify` reads as a recording."""
 
     kind = BY_NAME["recall"]
 
 
 class StoredComparison(StoredResult):
-    """What changed between two calibrations."""
+    """A comparison of two calibrations: the changes between them."""
 
     kind = BY_NAME["comparison"]
 
 
 class StoredDrift(StoredResult):
-    """Drift during a measurement."""
+    """A result on the drift during a measurement."""
 
     kind = BY_NAME["drift"]
 
 
 class StoredLog(StoredResult):
-    """The calibrations of one robot."""
+    """A log of the calibrations of one robot."""
 
     kind = BY_NAME["log"]
 
 
 class StoredFleet(StoredResult):
-    """The calibrations of many arms."""
+    """A fleet: the calibrations of many arms."""
 
     kind = BY_NAME["fleet"]
 
 
 class StoredStudy(StoredResult):
-    """Trials of identification methods, and what they say."""
+    """A study: trials of identification methods, and their evaluation."""
 
     kind = BY_NAME["study"]
 
 
 class StoredExport(StoredResult):
-    """A calibrated robot in the forms that other programs read."""
+    """An exported robot: a calibrated robot in the formats of other programs."""
 
     kind = BY_NAME["export"]
 
 
 class StoredPackage(StoredResult):
-    """A ROS 2 package."""
+    """A ROS 2 package of a calibrated robot."""
 
     kind = BY_NAME["package"]
 
@@ -167,11 +167,11 @@ def open_result(path: str | Path, verb: str = "result") -> StoredResult:
     """Return the result in a folder or a file.
 
     Args:
-        path: what a command wrote, or a session.
-        verb: what asks, for the message (`calib.result_kinds.TAKES`).
+        path: folder or file that a command wrote, or a session.
+        verb: name of the command that opens it, for the message (`calib.result_kinds.TAKES`).
 
     Raises:
-        UsageError: where there is no result.
+        UsageError: if there is no result.
     """
     path = Path(path)
     kind = kind_of(path)
@@ -182,14 +182,14 @@ def open_result(path: str | Path, verb: str = "result") -> StoredResult:
 
 
 def drawn(path: str | Path, robot: str | None = None) -> Scene:
-    """Return what the viewer draws of a result, of any CSV of poses, or of a folder with several results.
+    """Return the scene that the viewer draws for a result, any CSV of poses, or a folder with several results.
 
     Args:
-        path: of the result, file or folder.
-        robot: the robot to draw; None for the result's.
+        path: file or folder of the result.
+        robot: name or file of the robot to draw; None: the result's robot.
 
     Raises:
-        UsageError: where there is nothing to see.
+        UsageError: if there is nothing to draw.
     """
     if kind_of(path) is not None:
         return open_result(path, "view").scene(robot)

@@ -1,8 +1,8 @@
-"""One protocol of results: `Result`, which a result in memory keeps as one in a folder does.
+"""The protocol of results: `Result`, fulfilled by results in memory and by results in folders.
 
-Verbs that take a result open it (`calib.results.registry.open_result`) and ask it. `StoredResult` is what all kinds in
-folders share; a kind has a class of its own where it can do more. What it cannot do it refuses, and says which folder
-or command to use instead (`calib.result_kinds`).
+Commands that take a result open it (`calib.results.registry.open_result`) and call its methods. `StoredResult` is the
+base class of all kinds in folders; a kind with more functions has a class of its own. A method that a kind does not
+support refuses with advice on the folder or command to use instead (`calib.result_kinds`).
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ class Result(Protocol):
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict; its level is `NOT_JUDGED` for what has none, as a motion."""
+        """The verdict; its level is `NOT_JUDGED` for results without a verdict, such as motions."""
         ...
 
     def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
-        """Write the result's folder (of a list of poses its files), and return its path."""
+        """Write the result's folder (for a list of poses, its files), and return its path."""
         ...
 
     def figures(self) -> Mapping[str, Picture]:
@@ -58,20 +58,20 @@ class Result(Protocol):
         ...
 
     def tables(self) -> Mapping[str, Table]:
-        """Return the tables by name, as the files that `save` writes hold them."""
+        """Return the tables by name, as in the files that `save` writes."""
         ...
 
     def scene(self, robot: str | None = None) -> Scene:
-        """Return what the viewer draws: robot, poses, motions, torques.
+        """Return the scene that the viewer draws: robot, poses, motions, torques.
 
         Args:
-            robot: the robot to draw; None for the result's.
+            robot: name or file of the robot to draw; None: the result's robot.
         """
         ...
 
 
 class ExportSettings(NamedTuple):
-    """What a calibrated robot is written from and as: the arguments of `calib.export`."""
+    """Source and format of an exported robot: the arguments of `calib.export`."""
 
     urdf: Path | None = None
     prior: str = "entropic"
@@ -82,7 +82,7 @@ class ExportSettings(NamedTuple):
 
 
 class Exported(NamedTuple):
-    """What an export has to say: verdicts other than pass, and remarks on the files."""
+    """Messages of an export: verdicts other than pass, and remarks on the files."""
 
     verdicts: Sequence[str]
     remarks: Sequence[str]
@@ -100,7 +100,7 @@ class StoredResult:
     """A result in its folder, or in its file.
 
     Attributes:
-        path: of the folder or file.
+        path: path of the folder or file.
     """
 
     kind: ClassVar[ResultKind]
@@ -109,7 +109,7 @@ class StoredResult:
 
     @property
     def verdict(self) -> Verdict:
-        """The verdict that ``metrics.json`` states."""
+        """The verdict stated in ``metrics.json``; its level is `NOT_JUDGED` if none is stated."""
         metrics = self.to_dict()
         verdict = metrics.get("verdict")
         if isinstance(verdict, Mapping):
@@ -120,7 +120,7 @@ class StoredResult:
 
     @property
     def verdicts(self) -> Verdicts:
-        """The verdicts of its stages and on its deliverables; empty where nothing was calibrated."""
+        """The verdicts on the result's stages and deliverables; empty if it is not a calibration."""
         return Verdicts()
 
     @property
@@ -139,18 +139,18 @@ class StoredResult:
         return None
 
     def check_arm(self, verb: str) -> None:
-        """Refuse results of robots that are no serial arms; the base class accepts all."""
+        """Refuse results of robots that are not serial arms; the base class accepts all results."""
 
     def require_session(self) -> Session:
-        """Refuse: this is no session."""
+        """Refuse, since the result is not a session; sessions return themselves."""
         self.refuse("session", SessionError)
 
     def motion(self) -> Path:
-        """Refuse: there is no motion to play."""
+        """Refuse, since there is no motion to play; motions return their file."""
         self.refuse("program")
 
     def to_dict(self) -> ParsedTable:
-        """Return the content of ``metrics.json``; empty without."""
+        """Return the content of ``metrics.json``; {} if there is no such file."""
         metrics = self.path / METRICS
         if not metrics.is_file():
             return {}
@@ -167,10 +167,10 @@ class StoredResult:
         return {path.stem: read_table(path) for path in sorted(self.path.glob("*.csv")) if _has_rows(path)}
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Copy the folder as it is, without its figures where `plots` is False.
+        """Copy the folder, without its figures if `plots` is False, and return the path of the copy.
 
         Raises:
-            UsageError: where something else is there.
+            UsageError: if other files exist at the target.
         """
         out = Path(out)
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -181,22 +181,22 @@ class StoredResult:
         )
 
     def scene(self, robot: str | None = None) -> Scene:
-        """Refuse: there is nothing to draw."""
+        """Refuse, since there is nothing to draw."""
         self.refuse("view")
 
     def export(self, into: Path, settings: ExportSettings) -> Exported:
-        """Refuse: there is no calibrated robot to write for other programs."""
+        """Refuse, since there is no calibrated robot to export."""
         self.refuse("export")
 
     def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
-        """Refuse: there is neither certificate nor report to write again."""
+        """Refuse, since the result has neither certificate nor report."""
         self.refuse("certificate")
 
     def certify(self, details: CertificateSection, plots: bool, svg: Path | None) -> list[str]:
-        """Write certificate and report again, and the report's figures as SVG into the folder `svg`.
+        """Write certificate and report again, and the report's figures as SVG into the folder `svg` (None: no SVG).
 
         Returns:
-            What was written, in words.
+            Messages on the written files.
         """
         from calib.folders import PAGES
         from calib.procedure.report.certificate import rendering
@@ -209,7 +209,7 @@ class StoredResult:
         return lines
 
     def status(self) -> Iterable[object]:
-        """Refuse: only a session has steps."""
+        """Refuse, since only a session has steps."""
         self.refuse("session", SessionError)
 
     def refuse(self, verb: str, kind: type[CalibError] = UsageError) -> NoReturn:
@@ -221,7 +221,7 @@ class Viewed(StoredResult):
     """A result that the viewer draws from its files."""
 
     def scene(self, robot: str | None = None) -> Scene:
-        """Return what the viewer draws."""
+        """Return the scene that the viewer draws."""
         from calib.results import scene_files
 
         return scene_files.read(self.path, robot)

@@ -1,6 +1,6 @@
-"""What the viewer draws of a result, as plain arrays: robot, poses with their errors, motions, torques.
+"""Scene of a result for the viewer, as plain arrays: robot, poses with their errors, motions, torques.
 
-All points are in the base of the arm that is drawn. `calib.results.scene_files` reads it from a folder, and
+All points are in the base frame of the drawn arm. `calib.results.scene_files` reads a scene from a folder, and
 `calib.apps.viewer.viewer` shows it.
 """
 
@@ -60,14 +60,15 @@ class Visual(Frozen):
 
 @dataclass(frozen=True, eq=False)
 class Measured:
-    """m measured poses: where the target was seen, and where the two arms say it is.
+    """m measured poses: target positions as measured, and as predicted by both arms.
 
     Attributes:
-        q: (m, n) [rad or m].
-        seen, nominal, calibrated: (m, 3) [m].
-        unseen: (m,) whether the row was kept from the fit.
-        turned: (m, 3) rotation vector from the calibrated arm's orientation to the one seen, as ``residuals.csv`` has
-            it [rad]; NaN where none was measured.
+        q: (m, n) joint values [rad or m].
+        seen, nominal, calibrated: (m, 3) measured and predicted positions [m].
+        unseen: (m,) whether the row was held out of the fit.
+        turned: (m, 3) rotation vector from the calibrated arm's orientation to the measured one, as in
+            ``residuals.csv``
+            [rad]; NaN if no orientation was measured.
     """
 
     q: np.ndarray
@@ -88,17 +89,18 @@ class Measured:
 
 @dataclass(frozen=True, eq=False)
 class ErrorSizes:
-    """Errors of m measured rows that have no place in the arm's base: their sizes alone.
+    """Errors of m measured rows without a position in the arm's base frame: magnitudes only.
 
-    Distances, bars, sockets, planes and images measure no position; validation rows with base and tool placement of
-    their own measure it in a frame that the fit's folder does not hold.
+    Distances, bars, sockets, planes and images measure no position; validation rows with their own base and tool
+    placement
+    measure it in a frame that the fit's folder does not contain.
 
     Attributes:
-        kind: ``position`` where the row's residual is one (in the instrument's frame, from a socket's mean point or
+        kind: ``position`` if the row's residual is a position (in the instrument's frame, from a socket's mean point or
             from a plane), else ``distance``.
-        q: (m, n) [rad or m].
-        nominal, calibrated: (m,) sizes of both arms' errors [m]; NaN where the fit states none.
-        unseen: (m,) whether the row was kept from the fit.
+        q: (m, n) joint values [rad or m].
+        nominal, calibrated: (m,) magnitudes of both arms' errors [m]; NaN if the fit does not state them.
+        unseen: (m,) whether the row was held out of the fit.
     """
 
     kind: str
@@ -110,7 +112,7 @@ class ErrorSizes:
 
 @dataclass(frozen=True, eq=False)
 class Played:
-    """A motion: times (N,) [s], joint values, and velocities where they are known (N, n)."""
+    """A motion: times (N,) [s], joint values (N, n) [rad or m], and velocities (N, n) if known."""
 
     name: str
     t: np.ndarray
@@ -120,10 +122,10 @@ class Played:
 
 @dataclass(frozen=True, eq=False)
 class Torques:
-    """Measured and predicted torques (N, rows) of a recording, at times t (N,) [s], and its joints (N, n).
+    """Measured and predicted torques (N, rows) of a recording, at times t (N,) [s], and its joint values (N, n).
 
     Attributes:
-        rows, units: what each torque is, by joint and kind, and its unit.
+        rows, units: name (joint and kind) and unit of each torque row.
     """
 
     name: str
@@ -140,15 +142,15 @@ class Scene:
     """Robot, poses, motions and torques to show.
 
     Attributes:
-        title: of the recording.
-        chain: the robot that is drawn; None where none is known.
-        meshes: of its links.
+        title: title of the scene.
+        chain: the robot to draw; None if unknown.
+        meshes: meshes of its links.
         measured: poses with their errors.
         sizes: errors of rows without a measured position in the arm's base.
-        chosen: names and joint values of pose plans (m, n), in the order of choice.
+        chosen: names and joint values (m, n) of pose plans, in the order of selection.
         played: motions.
-        torques: recordings.
-        notes: what could not be shown.
+        torques: torques of recordings.
+        notes: texts on results that could not be shown.
     """
 
     title: str
@@ -163,7 +165,7 @@ class Scene:
 
 
 def strips(chain: Chain | Drawn, q: np.ndarray) -> list[np.ndarray]:
-    """Return the lines (m, k, 3) [m] by which a robot is drawn; an arm has one."""
+    """Return the lines (m, k, 3) [m] that represent a robot at joint values q (m, n); an arm has one line."""
     if isinstance(chain, Chain):
         return [skeleton(chain, q)]
     return chain.strips(q)

@@ -40,14 +40,14 @@ REHEARSAL_RATE = 10.0
 
 
 def read(folder: str | Path, robot: str | None = None) -> Scene:
-    """Return what to show of a folder's results: robot, poses, motions, torques.
+    """Return the scene of a folder's results: robot, poses, motions, torques.
 
     Args:
-        folder: of a fit, an identification, an excitation, a plan, or a session; or a CSV of poses or of a run.
-        robot: the arm to draw; None for the folder's own.
+        folder: folder of a fit, an identification, an excitation, a plan, or a session; or a CSV of poses or of a run.
+        robot: name or file of the arm to draw; None: the folder's robot.
 
     Raises:
-        UsageError: where there is nothing to see.
+        UsageError: if there is nothing to draw.
     """
     folder = Path(folder)
     is_csv = folder.is_file() and folder.suffix == ".csv"
@@ -79,7 +79,7 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
 
 
 def _robot(folder: Path, robot: str | None) -> tuple[Chain | Drawn | None, Path | None]:
-    """Return the robot to show, and the URDF or other description that it came from, if that is there."""
+    """Return the robot to draw (None if unknown), and its URDF or other description (None if not found)."""
     stage = stage_of(robot or folder, "view")
     if stage is not None:
         return stage.run(), None
@@ -120,8 +120,8 @@ def _meshes(chain: Chain | Drawn | None, source: Path | None) -> tuple[list[Visu
 def visuals(path: str | Path) -> tuple[list[Visual], list[str]]:
     """Return the meshes of a URDF's ``<visual>`` elements, and the names of missing files.
 
-    Read from our own parsed XML, not by yourdfpy: one capsule, or one ``<visual>`` without geometry, makes that refuse
-    the whole file (ValueError, TypeError), and ``package://`` is resolved as for collision shapes, see `find_mesh`.
+    The XML is parsed here and not by yourdfpy, which refuses a whole file for one capsule or one ``<visual>`` without
+    geometry (ValueError, TypeError). ``package://`` is resolved as for collision shapes, see `find_mesh`.
     """
     search_folders = list(Path(path).resolve().parents)
     meshes = []
@@ -138,7 +138,7 @@ def visuals(path: str | Path) -> tuple[list[Visual], list[str]]:
 
 
 def _errors(folder: Path, chain: Chain | Drawn | None) -> tuple[list[Measured], list[ErrorSizes]]:
-    """Return the errors of a fit's rows, in a session with those of its unseen poses: with, and without a position."""
+    """Return the errors of a fit's rows, and of a session's unseen poses: with position, and magnitudes only."""
     measured = []
     sizes = []
     for fit_folder in (folder, folder / IN_SESSION):
@@ -185,7 +185,7 @@ def _measured(folder: Path, chain: Chain | Drawn | None) -> Measured:
 
 
 def _unplaced(folder: Path, chain: Chain | Drawn | None) -> list[ErrorSizes]:
-    """Return the errors of the rows of ``residuals.csv`` that `_measured` leaves out, by their kind."""
+    """Return the errors of the rows of ``residuals.csv`` without a position in the arm's base, by their kind."""
     if isinstance(chain, Drawn):
         return []
     cell = installation.read(folder)
@@ -319,7 +319,9 @@ def _torque_rows(folder: Path, chain: Chain | Drawn | None, count: int) -> tuple
     """Return the labels and units of an identification's torque rows.
 
     Args:
-        folder: of the file of torques: the identification's, or ``unseen`` in it.
+        folder: folder of the table of torques: that of the identification, or its subfolder ``unseen``.
+        chain: the robot; None if unknown.
+        count: number of torque rows.
     """
     if chain is not None:
         for identification in (IdentificationFolder(folder), IdentificationFolder(folder.parent)):
@@ -336,7 +338,7 @@ def _torque_rows(folder: Path, chain: Chain | Drawn | None, count: int) -> tuple
 
 
 def _model_rows(model: dict, chain: Chain | Drawn, count: int) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
-    """Return labels and units of the torque rows that ``dynamics.json`` states; None where there are not `count`."""
+    """Return labels and units of the torque rows by ``dynamics.json``; None if their number is not `count`."""
     unit = model.get("unit", "N m")
     if isinstance(chain, Drawn):
         titles, units = chain.torque_rows(model.get("kind", ""))
@@ -363,7 +365,7 @@ def _below(folder: Path, pattern: str) -> list[Path]:
 
 
 def _label(path: Path, folder: Path) -> str:
-    """Return what a file of a folder or of its subfolders is shown under."""
+    """Return the label under which a file of a folder or of its subfolders is shown."""
     parent = path.parent
     if parent == folder:
         return path.stem

@@ -1,14 +1,13 @@
-"""Parallel execution of tasks: in this process, local processes, or on a Dask scheduler by address.
+"""Parallel execution of tasks: in this process, in local processes, or on a Dask scheduler by address.
 
-`Workers.completed` hands results back as they come, `Workers.map` in order; ``poses`` and ``trajectories`` take the
-latter as a plain callable. Functions, tasks and results must pickle. A task whose process dies is tried again, here or
-by the scheduler: it may therefore run twice, yet its result counts once. One lost for good is a `TaskLost`, and costs
-no other result. Few tasks are under way at once (one a process, or a thread of the cluster), so that millions may be
-asked for; each should take a tenth of a second or more.
+`Workers.completed` yields results as they complete, `Workers.map` in order; ``poses`` and ``trajectories`` use
+`Workers.map` as a plain callable. Functions, tasks and results must pickle. If the process of a task dies, the task is
+repeated, here or by the scheduler: it may run twice, but yields one result. A task that fails repeatedly yields a
+`TaskLost` and does not affect the others. Few tasks are in progress at a time (one per process, or per thread of the
+cluster), so that there may be millions; each should take a tenth of a second or more.
 
-Processes are spawned, not forked, so that threads of numerical libraries do no harm; a script that uses them needs
-``if __name__ == "__main__"``. BLAS, OpenMP and numba get one thread in every worker: the tasks are what runs in
-parallel.
+Processes are spawned, not forked, since forked threads of numerical libraries may block; scripts that use workers need
+``if __name__ == "__main__"``. BLAS, OpenMP and numba get one thread in every worker, since the tasks run in parallel.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ class Workers:
     """Runs many tasks in parallel, created by `workers`.
 
     Attributes:
-        here: whether they work in this process's current folder.
+        here: whether tasks run in this process's current folder.
     """
 
     _stream: Stream
@@ -45,7 +44,7 @@ class Workers:
     def completed(self, function: Callable[..., Any], tasks: Iterable[object]) -> Iterator[tuple[int, Any]]:
         """Yield (number of the task, its result) as tasks complete; tasks are read from the iterable as needed.
 
-        The result of a task lost for good is a `TaskLost`, yielded as the others are. What a task raises is raised.
+        A task that was lost repeatedly has a `TaskLost` as its result. An exception of a task is raised.
         """
         with closing(self._stream(function, ((task,) for task in tasks), lambda number: True)) as answers:
             for number, result, error in answers:
@@ -54,17 +53,18 @@ class Workers:
                 yield number, result if error is None else error
 
     def map(self, function: Callable, *items: Iterable[object]) -> Iterator[Any]:
-        """Yield results in the order of the tasks, like the builtin; after Ctrl-C the available results, then raise.
+        """Yield results in the order of the tasks, like the builtin `map`; after Ctrl-C, the available results, then
+        raise.
 
         Raises:
-            TaskLost: in place of a lost result.
+            TaskLost: instead of a lost result.
         """
         return self._in_order(None, function, *items)
 
     def map_without(self, lost: list[TaskLost]) -> Callable[..., Iterator[Any]]:
         """Return a `map` for searches that need only the best result: lost tasks are appended to `lost`.
 
-        Where all are lost, it raises the last `TaskLost`.
+        If all tasks are lost, it raises the last `TaskLost`.
         """
         return partial(self._in_order, lost)
 

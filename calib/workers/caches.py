@@ -1,9 +1,9 @@
-"""Folders in which numba and matplotlib keep what they made once, where their usual ones cannot be written.
+"""Cache folders of numba and matplotlib, for users whose usual cache folders are not writable.
 
-numba refuses to load a kernel that it cannot keep ("no locator available"); matplotlib complains, and looks for fonts
-anew in every process. As with a package installed by an administrator and a home that is read-only or does not exist
-(containers, CI, services), both then get a folder of the user's own in the temporary folder. What the user sets in the
-environment counts; worker processes inherit it.
+numba refuses to load a kernel that it cannot cache ("no locator available"); matplotlib warns, and searches fonts anew
+in every process. If the package is not writable and the home folder is read-only or missing (containers, CI, services),
+both get a folder of the user in the temporary folder. Variables that the user sets have priority; worker processes
+inherit them.
 """
 
 import os
@@ -57,10 +57,10 @@ def _writable(folder: Path) -> bool:
 
 
 def _temporary(name: str) -> Path:
-    """Return a folder of this user alone that stays for later processes; of this process where that is another's.
+    """Return a private folder of this user that persists for later processes; if another user owns it, a new one.
 
     Raises:
-        OSError: where no temporary folder is writable.
+        OSError: if no temporary folder is writable.
     """
     import atexit
     import shutil

@@ -23,7 +23,7 @@ NO_WORKERS = 60.0  # [s] without any worker at a scheduler (our choice)
 
 
 class _Cluster:
-    """A Dask scheduler's workers: Dask itself repeats lost tasks as often as configured."""
+    """Workers of a Dask scheduler; Dask repeats lost tasks as often as configured."""
 
     attempts = 1
 
@@ -89,7 +89,7 @@ class _Cluster:
         yield self.under_way.pop(future.key)[0], result, raised
 
     def _failed(self, error: Exception) -> Exception:
-        """Return the exception that stands for a task's result where Dask failed, not the task."""
+        """Return the exception to report as a task's result if Dask failed, and not the task."""
         from distributed import KilledWorker  # pyright: ignore[reportMissingImports]
 
         if isinstance(error, KilledWorker):

@@ -27,11 +27,11 @@ Stream = Callable[[Callable, Iterable[tuple], Callable[[int], bool]], Generator[
 
 
 class Died(Exception):
-    """Stands for the result of a task whose process died while running the task."""
+    """Result of a task whose process died while running it."""
 
 
 class NotBegun(Exception):
-    """Stands for the result of a task whose process died before it received the task."""
+    """Result of a task whose process died before it received the task."""
 
 
 class Crew(Protocol):
@@ -49,7 +49,7 @@ class Crew(Protocol):
     def begin(self, number: int, call: bytes) -> None: ...
 
     def ended(self) -> Iterable[Answer]:
-        """Return the answers of the tasks that ended, after waiting for one at least."""
+        """Return the answers of the completed tasks, after waiting for at least one."""
         ...
 
     def settled(self) -> Iterable[Answer]:
@@ -69,7 +69,7 @@ class _Task:
 
 
 def streamed(crew: Crew, function: Callable, tasks: Iterable[tuple], near: Callable[[int], bool]) -> Generator[Answer]:
-    """Run tasks and yield their answers as they arrive; a task starts when a worker is free and `near(number)`."""
+    """Run tasks and yield their answers as they arrive; task k starts when a worker is free and `near(k)` is true."""
     if not crew.busy.acquire(blocking=False):
         raise RuntimeError("these workers are busy; let one `map` or `completed` end before the next")
     upcoming, begun = enumerate(tasks), 0
@@ -126,9 +126,10 @@ def run_call(
     """Run a pickled call in a worker; return (result, raised exception), pickled.
 
     Args:
-        hear: called before it, to hear of Ctrl-C.
-        dumps: what pickles.
-        hush: called as it raised, to hear of no other Ctrl-C: a terminal's comes beside the parent's own.
+        call: the pickled call.
+        hear: called before the call, to accept Ctrl-C.
+        dumps: function that pickles the answer.
+        hush: called after an exception, to ignore further Ctrl-C, since terminal and parent process both send one.
     """
     try:
         hear()
@@ -188,7 +189,7 @@ class _Process:
 
 
 class Processes:
-    """Local processes, started when tasks need them."""
+    """Runner of tasks in local processes, which are started when tasks need them."""
 
     attempts = ATTEMPTS
 

@@ -91,7 +91,10 @@ def _limit_for_good() -> None:
 
 
 def _set(threads: dict["LibController", int]) -> None:
-    """Set the thread numbers of libraries, from any thread: threadpoolctl 3.8 heeds one alone until it is cleared."""
+    """Set the thread numbers of libraries, from any thread.
+
+    threadpoolctl 3.8 accepts settings from the controlling thread only, until this thread is cleared.
+    """
     for library, number in threads.items():
         clear = getattr(library, "clear_controlling_thread", lambda force: None)
         clear(force=True)
@@ -101,7 +104,7 @@ def _set(threads: dict["LibController", int]) -> None:
 
 @cache
 def _libraries() -> list["LibController"]:
-    """Return all loaded BLAS libraries: looking for them takes milliseconds, setting their threads microseconds."""
+    """Return all loaded BLAS libraries; cached, since their search takes milliseconds, setting threads microseconds."""
     from threadpoolctl import ThreadpoolController
 
     controllers = ThreadpoolController().select(user_api="blas").lib_controllers

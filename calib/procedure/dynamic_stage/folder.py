@@ -76,22 +76,24 @@ class IdentificationFolder:
 
     @property
     def tables(self) -> tuple[Path, Path]:
-        """Paths of the estimate and of its covariance."""
+        """Paths of the parameter estimate (``estimate.csv``) and its covariance (``covariance.csv``)."""
         return self.path / folders.ESTIMATE, self.path / folders.COVARIANCE
 
     @property
     def torques(self) -> list[Path]:
-        """Paths of measured and predicted torques on unseen motion; empty without such motion."""
+        """Paths of the tables of measured and predicted torques on unseen motion; without unseen motion, the training
+        table.
+        """
         return sorted(self.unseen.path.glob("torques_*.csv")) or [self.path / "torques_1.csv"]
 
     @property
     def unseen(self) -> UnseenFolder:
-        """Folder of the model's results on unseen motion, in a session."""
+        """Folder of the model's validation on unseen motion, which only sessions write."""
         return UnseenFolder(self.path / "unseen")
 
     @property
     def judged(self) -> UnseenReport:
-        """Report of the model on unseen motion: a session's, else that of `calib identify`, in the folder itself."""
+        """Report of the model on unseen motion: the session's if it exists, else the report of `calib identify`."""
         return (self.unseen if self.unseen.report.is_file() else UnseenFolder(self.path)).read()
 
     def dynamics(self) -> Dynamics:
@@ -103,7 +105,7 @@ class IdentificationFolder:
         return read_json(self.numbers, "identify again", ModelMetrics, with_current_keys)
 
     def findings(self) -> ModelFindings:
-        """Read the findings on the model; older folders contain only warnings."""
+        """Read the findings on the model; folders of earlier versions contain only the warnings' texts."""
         metrics = self.metrics()
         return metrics.findings or ModelFindings(Resting(), metrics.warnings)
 
@@ -112,7 +114,7 @@ class IdentificationFolder:
         return tuple(row.name for row in folders.read_estimate(self.path, _Essential) if row.essential is not None)
 
     def errors(self) -> TorqueErrorModel | None:
-        """Read the model's expected torque errors; None if they are unknown."""
+        """Read the model's expected torque errors; None if no errors or no covariance were stored."""
         discrepancy = self.findings().errors
         if discrepancy is None:
             return None
@@ -156,7 +158,14 @@ def write_folder(
 ) -> Path:
     """Write the result folder `out` of an identification, or nothing on an error, and return its path.
 
-    An `owned` folder is ours, whatever is left in it.
+    Args:
+        outcome: the identification.
+        out: path of the folder.
+        plots: writes figures into the folder; None: no figures.
+        owned: whether the procedure owns the folder, so that its content may be replaced without a check.
+
+    Raises:
+        UsageError: if a folder that is not owned contains input files, or files that no identification writes.
     """
     if not owned:
         check_identification_target(out, [outcome.inputs.source, outcome.inputs.source.parent])
@@ -170,7 +179,7 @@ def write_folder(
 
 
 def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
-    """Write all files of an identification but its figures and pages."""
+    """Write all files of an identification, except figures and pages."""
     inputs, identification = outcome.inputs, outcome.found
     robot = inputs.robot
     if isinstance(robot, Mechanism):
@@ -212,8 +221,9 @@ def _write_torques(
 ) -> Path:
     """Write measured and predicted torques (N, rows) of a recording and its joints (N, n), at about `TORQUE_RATE`.
 
-    Where it is known, with the standard deviation expected of the errors, and 1 where the model extrapolates; without a
-    payload on board with speeds and accelerations, too, for `read_torques`.
+    If `intervals` are known, columns are added for the expected standard deviation of the error, and for whether the
+    model extrapolates (1) or not (0). Recordings without a payload also get speeds and accelerations, for
+    `read_torques`.
     """
     motion = case.motion
     rows = np.arange(0, len(motion), max(1, round(motion.rate / TORQUE_RATE)))
@@ -250,8 +260,9 @@ def read_torques(path: Path) -> dict[str, np.ndarray]:
 def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[object, ...]]:
     """Return a row of ``estimate.csv`` for each parameter, with the columns `HEADER`; RSD in percent.
 
-    σ is the total; the geometry's part is left out where the geometry is taken as exact. Terms that the evidence
-    switched off, and parameters that a constraint holds, have no σ: nobody measured them.
+    σ is the total; the columns of the geometry's part are omitted if the geometry is taken as exact. Friction terms
+    that
+    were switched off, and parameters fixed by a constraint, have no σ, because they were not measured.
     """
     identification, carried = outcome.found, outcome.carried
     estimate = identification.fitted.estimate
@@ -286,7 +297,9 @@ def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[object, ...]]:
 
 
 def _expressions(identification: Identification, unmeasured: Sequence[str], bound: Sequence[str]) -> list[str]:
-    """Return for each parameter what it holds: the standard parameters, or the shape of a drive term."""
+    """Return for each parameter its meaning as text: a combination of standard parameters, or the shape of a drive
+    term.
+    """
     lines = [line.split(" = ", 1)[1] for line in expressions(identification.base)]
     for term in identification.friction.terms:
         remark = ", switched off: not measured" if term.name in unmeasured else ""

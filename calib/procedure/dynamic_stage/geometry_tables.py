@@ -43,7 +43,7 @@ TORQUE_COVARIANCE = "covariance_torque.csv"
 
 @dataclass(frozen=True)
 class TiltEffect:
-    """Parameter that a base tilt of 1 mrad changes most, and the change, in sigmas from torque noise."""
+    """Parameter that a base tilt of 1 mrad changes most, and the change in σ of torque noise."""
 
     parameter: str
     sigmas: float
@@ -64,11 +64,12 @@ class GeometryMetrics:
 
     Attributes:
         propagated: whether the robot came with a covariance of its geometry.
-        summary: in a sentence.
-        changed, geometry_exceeds_torque: parameters whose σ it raises, and those where it exceeds the torques' part.
-        moved_by_1_mrad_of_tilt: what else a tilt of the base would move.
-        largest_growth_of_sigma: of any parameter, as a factor.
-        largest_changes_from_nominal: the five largest.
+        summary: the effect in one sentence.
+        changed: names of the parameters whose σ the geometry's uncertainty raises.
+        geometry_exceeds_torque: names of the parameters where the geometry's part of σ exceeds that of torque noise.
+        moved_by_1_mrad_of_tilt: parameter that a tilt of the base would change most.
+        largest_growth_of_sigma: largest ratio of total σ to σ from torque noise, over all parameters.
+        largest_changes_from_nominal: the five largest differences between the estimates on both geometries.
     """
 
     propagated: bool
@@ -135,12 +136,16 @@ def _ranking(carried: GeometryUncertainty) -> np.ndarray:
 
 
 def effects(carried: GeometryUncertainty) -> list[GeometricEffect]:
-    """Return the rows of ``geometry_effects.csv``, the most harmful element first.
+    """Return the rows of ``geometry_effects.csv``, sorted by the shift that an element causes, largest first.
 
-    shift_sigma: of the parameter that moves most, by one σ of the element, in that parameter's σ from torque noise;
-    shift_sigma_per_milli: by 1 mm or 1 mrad. torque_rms: what one σ does to the rigid torque at fixed parameters;
-    torque_rms_left: after the parameters have been estimated anew. An element matters where it alone raises some σ by
-    more than 1 %; without a σ nothing can be said.
+    Columns: `shift_sigma` is the shift of the parameter that moves most when the element changes by one σ, in units of
+    that parameter's σ from torque noise; `shift_sigma_per_milli` is its shift by 1 mm or 1 mrad. `torque_rms` is the
+    rms
+    change of the rigid torque by one σ at fixed parameters, `torque_rms_left` the change that remains after the
+    parameters
+    have been estimated anew. An element matters if it alone raises some parameter's σ by more than 1 %; elements
+    without
+    σ have no entries.
     """
     rows = []
     shifts_per_unit = _per_sigma(carried)
@@ -239,7 +244,9 @@ def summary(carried: GeometryUncertainty) -> str:
 
 
 def _tilt(carried: GeometryUncertainty) -> TiltEffect:
-    """Return the parameter that 1 mrad of base tilt against gravity changes most, and its change in σ of torque."""
+    """Return the parameter that 1 mrad of base tilt against gravity changes most, and its change in σ of torque
+    noise.
+    """
     size = 1e-3 * _per_sigma(carried)[:, -len(TILTS) :].max(axis=1, initial=0.0)
     worst = int(np.argmax(size))
     return TiltEffect(carried.names[worst], float(size[worst]))

@@ -1,4 +1,4 @@
-"""Findings on hypotheses that explain recordings better than what was stated: gravity, loads (catalogue, chapter 9)."""
+"""Findings on hypotheses that explain recordings better than the stated gravity or loads (catalogue, chapter 9)."""
 
 from collections.abc import Sequence
 
@@ -17,9 +17,10 @@ MAX_COMPARED = 12  # recordings in which an unstated load is looked for (our cho
 
 
 def gravity_hypotheses(inputs: IdentificationInputs) -> GravityHypotheses | None:
-    """Return what the training recordings say of gravity; None where they hold no motor torques, or too few samples.
+    """Return how well other gravity vectors explain the training recordings; None without motor torques or enough
+    samples.
 
-    Recordings with one payload, or without any, are looked at together: those with the most samples.
+    Of the recordings grouped by payload, the group with the most samples is used.
     """
     if not isinstance(inputs.chain, Chain) or not inputs.options.settings.torque_rows.has_bodies:
         return None
@@ -32,7 +33,7 @@ def gravity_hypotheses(inputs: IdentificationInputs) -> GravityHypotheses | None
 
 
 def gravity_findings(hypotheses: GravityHypotheses | None, joints: Sequence[str]) -> list[Finding]:
-    """Return the findings that gravity has another direction, or is not in the torques of some joints."""
+    """Return the findings that gravity has another direction, or does not act on the torques of some joints."""
     if hypotheses is None:
         return []
     findings = []
@@ -57,10 +58,11 @@ def gravity_findings(hypotheses: GravityHypotheses | None, joints: Sequence[str]
 def load_findings(inputs: IdentificationInputs, gravity: Sequence[float] | None) -> list[Finding]:
     """Return the findings that a recording carries a load which the options do not state.
 
-    Recordings with the same stated payload are compared, training and unseen ones.
+    Recordings with the same stated payload, training and unseen, are compared with each other.
 
     Args:
-        gravity: in the base frame [m/s²], where it is not the robot's own.
+        inputs: the recordings.
+        gravity: gravity (3,) in the base frame [m/s²]; None: that of the robot's description.
     """
     rows = inputs.options.settings.torque_rows
     if not isinstance(inputs.chain, Chain) or inputs.unit != TORQUE or not rows.has_bodies:
@@ -96,5 +98,5 @@ def _typical(shares: np.ndarray) -> float:
 
 
 def _vector(vector: np.ndarray, between: str) -> str:
-    """Return a vector (3,) [m/s²] as text, as an option takes it."""
+    """Return a vector (3,) [m/s²] as text, with the components separated as an option expects."""
     return between.join(f"{component:.4g}" for component in np.round(vector, 3) + 0.0)

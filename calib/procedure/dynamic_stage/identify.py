@@ -1,6 +1,6 @@
-"""Identification of the guided procedure: the model, its errors on the recordings, and the verdict.
+"""Identification stage of the guided procedure: identified model, its errors on the recordings, and the verdict.
 
-`assess` returns the same result for a new model and for one read from its folder.
+`assess` returns the same result for a new model and for a model read from its folder.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,13 +40,13 @@ class ModelFindings:
     """Findings of an identification that the verdict needs in addition to the recordings; stored in its folder.
 
     Attributes:
-        rests: its parameters that rest on a prior.
+        rests: parameters that rest on a prior rather than on the recordings.
         notes: remarks on the model in folders of earlier versions, as text.
-        noticed: findings on the model, whatever the unseen recordings are.
-        controller: that was stated or identified; None without any.
-        errors: what makes errors of its torques likely; None where too little was recorded to say.
-        contradiction: its distance from every physically consistent robot; None if unknown.
-        unlike: how recorded torques refute an estimate that takes the loop for granted; None where they do not.
+        noticed: findings on the model that do not depend on unseen recordings.
+        controller: stated or identified controller; None without one.
+        errors: distribution of the model's torque errors; None if too little was recorded to estimate it.
+        contradiction: distance of the estimate from every physically consistent robot; None if unknown.
+        unlike: how recorded torques refute an estimate that relies on the stated control loop; None if they do not.
         plain: (p,) the model's parameters by plain least squares; () in files of earlier versions.
     """
 
@@ -65,11 +65,11 @@ class RecordingErrors:
     """Errors of a model on the recordings.
 
     Attributes:
-        fit, validation: case name → its score.
-        predictions: case name → predicted torques (N, rows) at the full rate.
-        repeated: validation case → share of its states that the training motion has been in, where it is no proof.
-        excitation: case name → what the motion can identify.
-        intervals: unseen case (without any, the first of the training) → the errors expected there.
+        fit, validation: name of a training or unseen recording → score of the model.
+        predictions: name of a recording → predicted torques (N, rows) at the full rate.
+        repeated: name of an unseen recording that repeats training motion → share of its states found in the training.
+        excitation: name of a recording → report on what its motion can identify.
+        intervals: name of an unseen recording (without any: of the first training recording) → expected torque errors.
     """
 
     fit: Mapping[str, Score]
@@ -90,12 +90,12 @@ class DynamicsAssessment(RecordingErrors):
     """Errors of a model on the recordings, and the verdict.
 
     Attributes:
-        verdict: as of `calib.procedure.dynamic_stage.verdict`.
-        warnings: what a user should know of the recordings, and of the model.
-        noticed: the findings behind the warnings.
-        tracking: by recording, the replays with the model fed forward.
-        tracking_failure: reason for missing replays.
-        references: by unseen recording, the errors of plain references beside the model's.
+        verdict: see `calib.procedure.dynamic_stage.verdict`.
+        warnings: texts on the recordings and the model for the user.
+        noticed: the findings that the warnings render.
+        tracking: name of a recording → simulated tracking with the model as feedforward.
+        tracking_failure: reason for missing replays; empty if there are replays.
+        references: name of an unseen recording → errors of the plain references beside the model's error.
     """
 
     verdict: Verdict
@@ -117,7 +117,7 @@ def repeated_motion(cases: Sequence[Case], unseen: Sequence[Case]) -> dict[str, 
 
 
 def overlaps(cases: Sequence[Case], unseen: Sequence[Case]) -> list[Finding]:
-    """Return the findings on samples that are both unseen and training data."""
+    """Return the findings on unseen recordings that share samples with a training recording."""
     findings = []
     for case, training in product(unseen, cases):
         if not training.motion.file or realpath(case.motion.file) != realpath(training.motion.file):
@@ -138,7 +138,10 @@ def errors_of(
     """Return the predictions of every recording by a model, and their errors.
 
     Args:
-        errors: the model's expected torque errors, for the intervals.
+        inputs: training and unseen recordings, and options.
+        dynamics: the model.
+        errors: expected torque errors of the model, for the intervals; None: no intervals.
+        say: called with the name of each step.
     """
     predictions, scores = {}, {}
     for case in (*inputs.cases, *inputs.unseen):
@@ -179,11 +182,12 @@ def assess(
     """Return the predictions of every recording by a model, their errors, and the verdict.
 
     Args:
-        inputs: training recordings (for the model's own error) and unseen ones.
+        inputs: training recordings (for the model's error on its own data) and unseen recordings.
         dynamics: the model.
-        findings: what is known of it.
-        errors: what errors its torques are expected to have.
-        wrong: joints that friction drives, where that is known already (`friction.passivity.driven`).
+        findings: findings on the model, from its identification.
+        errors: expected torque errors of the model; None if unknown.
+        wrong: indices of joints whose friction term adds energy; None: computed by `friction.passivity.driven`.
+        progress: called with the name of each step; None: silent.
     """
     say = progress or silent
     if wrong is None:
@@ -265,7 +269,7 @@ class IdentificationOutcome(DynamicsAssessment):
         carried: effect of the geometry's uncertainty; None if it was not requested.
         geometries: comparison with the estimate on the nominal geometry; None if the geometry is nominal.
         errors: expected torque errors; None if too little was recorded to estimate them.
-        seed: of all random numbers.
+        seed: seed of all random numbers.
     """
 
     inputs: IdentificationInputs
@@ -283,7 +287,9 @@ T = TypeVar("T", bound=IdentificationOutcome)
 def run(inputs: IdentificationInputs, progress: Progress | None = None) -> IdentificationOutcome:
     """Return the outcome of an identification: the model, its prediction of every recording, and the verdict.
 
-    Where the torques refute gravity as stated, no richer friction is tried: couplings would take its place.
+    If the torques refute the stated gravity, only the standard friction model is tried: richer friction, such as
+    couplings
+    between joints, would absorb the error of gravity.
     """
     settings = inputs.options.settings
     hypotheses = gravity_hypotheses(inputs)
@@ -298,7 +304,7 @@ def judged(
     """Return the outcome of a finished identification: predictions of every recording, errors, and the verdict.
 
     Raises:
-        MeasurementError: where friction would drive most joints.
+        MeasurementError: if the identified friction would drive most joints instead of braking them.
     """
     say = progress or silent
     # refused before hours go into the geometry's share
@@ -329,7 +335,9 @@ def judged(
 
 
 def assessed(outcome: T, inputs: IdentificationInputs) -> T:
-    """Return an outcome with a new verdict on the unseen recordings of `inputs`; nothing is identified."""
+    """Return an outcome with predictions, errors and verdict for the recordings of `inputs`; the model stays
+    unchanged.
+    """
     stage = stage_of(inputs.robot, "identify")
     if stage is not None and stage.judge is not None:
         assessment = stage.judge(inputs, outcome.found, outcome.findings)

@@ -57,7 +57,7 @@ class IdentificationInputs:
     Attributes:
         robot: `CalibratedChain` from a geometric fit or from a description, with joint corrections only where these
             move the links; or a `calib.procedure.robot_kinds.Mechanism`.
-        source: the file it came from.
+        source: file that the robot was read from.
         cases: training recordings.
         unseen: recordings to be predicted.
         options: content of the options file, updated by the command's options.
@@ -82,7 +82,9 @@ class IdentificationInputs:
 
     @property
     def row_units(self) -> tuple[str, ...]:
-        """Unit of each torque row; separate amperes for a joint without an identified gain."""
+        """Unit of each torque row; joints without an identified gain have amperes of their own, excluded from
+        totals.
+        """
         rows = self.options.settings.torque_rows.units([joint.kind == "prismatic" for joint in self.chain.joints])
         if self.unit == TORQUE:
             return tuple(rows)
@@ -96,7 +98,7 @@ class IdentificationInputs:
 
     @property
     def chain(self) -> Any:
-        """Identified arm; for other robots, their actuated joints with names and limits."""
+        """Identified arm (`Chain`); for other robots, their actuated joints with names and limits."""
         return self.robot.chain
 
     def with_unseen(self, validate: Sequence[str | Path | Recording]) -> IdentificationInputs:
@@ -135,13 +137,19 @@ def gather(
     """Return the inputs of an identification from files: the robot, and all recordings as motions.
 
     Args:
-        robot: see `calib.robot.library`; or as a geometric fit returns it.
-        recordings, validate: paths, each with a cut if wanted (``log.npz@0:9.4``), or recordings in memory.
-        options: the options file's content.
-        method, friction: in place of the options'.
-        base, tip: links of a URDF.
-        seed: for everything random.
-        designed: motions of which a recording without a reference contains one, for options with a [loop].
+        robot: a name or file as in `calib.robot.library`, or a robot as a geometric fit returns it.
+        recordings, validate: training and unseen recordings: paths, each with an optional cut (``log.npz@0:9.4``), or
+            recordings in memory.
+        options: content of the options file; None: defaults.
+        method, friction: replace those of the options; None: as in the options.
+        base, tip: links of a URDF at which the chain begins and ends; None: see `calib.robot.library`.
+        seed: seed of all random numbers.
+        designed: designed motions to search for in recordings without a reference, if the options have a [loop].
+        progress: called with the name of each step; None: silent.
+
+    Raises:
+        UsageError: without a recording, and for unknown options.
+        MeasurementError: for a recording that cannot be used.
     """
     options = _with_choices(options or IdentifyOptions(), method, friction, seed)
     if not recordings:
@@ -223,7 +231,7 @@ def _check_payloads(cases: Sequence[Case], unseen: Sequence[Case], settings: Ide
 
 
 def _path(recording: str | Path | Recording) -> str:
-    """Return the path of a recording; in memory, its file and time span (so that two cuts of a file differ)."""
+    """Return the path of a recording; for a recording in memory, its file and time span (so that two cuts differ)."""
     if not isinstance(recording, Recording):
         return str(recording)
     file = recording.file or "recording"
@@ -270,11 +278,11 @@ def read_motion(
     """Return the motion of a recording, checked against the robot's joints and limits.
 
     Args:
-        given: a path, with a cut if wanted, or the recording.
+        given: a path, with an optional cut, or a recording in memory.
         chain: the robot, or its joints.
-        own: the options for its file.
-        like: a motion whose identification band it is judged in, where the options state none; how far its own
-            positions need filtering, it says itself.
+        own: the options for the recording's file.
+        like: motion whose identification band is used if the options state none; the cutoff of the position filter
+            still follows from the recording itself. None: both follow from the recording.
     """
     joints = chain if isinstance(chain, Joints) else joints_of(chain)
     if isinstance(given, Recording):
@@ -312,9 +320,9 @@ def _joints(values: np.ndarray) -> tuple[float, ...]:
 
 
 def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampled: Resampled) -> Motion:
-    """Return the motion with a higher f_q if the encoders have low noise: f_q ≥ 5 f_dyn is a minimum.
+    """Return the motion filtered with a higher cutoff f_q if the encoder noise is low: f_q ≥ 5 f_dyn is only a minimum.
 
-    f_q is doubled where noise stays below `QUIET` of every moving joint's rms acceleration (our choice).
+    f_q is doubled if the noise stays below `QUIET` of every moving joint's rms acceleration (our choice).
     """
     rms = np.sqrt(np.mean(motion.a**2, axis=0))
     moves = np.ptp(motion.q, axis=0) > MIN_RANGE
@@ -338,7 +346,9 @@ def _referred(
     options: IdentifyOptions,
     designed: Sequence[DesignedMotion],
 ) -> Motion:
-    """Return the motion with its reference: of a file that the options name, its own, or a designed motion."""
+    """Return the motion with its reference positions: from a file named in the options, the recording, or a designed
+    motion.
+    """
     file_options, loop = options.file_settings(_path(recording)), options.settings.loop
     if loop is None:
         return motion
@@ -363,7 +373,10 @@ def _with_design(
 ) -> Motion:
     """Return the part of a motion in which whole periods of a designed motion were played, with it as the reference.
 
-    They are looked for in the whole file: a cut may contain less than a period.
+    The designed motion is searched in the whole file, since a cut may contain less than a period.
+
+    Raises:
+        MeasurementError: if no designed motion is found.
     """
     recording = source
     if not isinstance(recording, Recording):

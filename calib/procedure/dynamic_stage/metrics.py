@@ -1,7 +1,7 @@
-"""The record of an identification, as console and certificate show it and ``metrics.json`` stores it (schema 3).
+"""Content of ``metrics.json`` (schema 3): the record of an identification that console and certificate show.
 
-Its fields are the keys of the file. Most are values of the mathematics, stored as they are typed. Until schema 3 the
-file had no number, and some keys another place: `with_current_keys` moves them.
+The fields are the keys of the file. Most are values of the estimation, stored as they are typed. Files before schema 3
+have no schema number and other keys; `with_current_keys` converts them.
 """
 
 from __future__ import annotations
@@ -41,7 +41,9 @@ BOUND_SIGMA = 1e-9
 
 @dataclass(frozen=True)
 class ParameterCounts:
-    """Numbers of parameters: in the model, identifiable from any motion, and kept."""
+    """Numbers of standard parameters, of base parameters (identifiable from any motion), and of essential
+    parameters.
+    """
 
     standard: int
     base: int
@@ -50,7 +52,7 @@ class ParameterCounts:
 
 @dataclass(frozen=True)
 class ColumnCounts:
-    """Standard parameters without effect on any torque, and those regrouped into others."""
+    """Numbers of standard parameters without effect on any torque, and of those regrouped into other parameters."""
 
     without_effect: int
     regrouped: int
@@ -58,7 +60,9 @@ class ColumnCounts:
 
 @dataclass(frozen=True)
 class ConditionNumber:
-    """Condition number of the observation matrix, in its units and with columns of unit norm."""
+    """Condition number of the observation matrix, in SI units (raw) and with columns scaled to unit norm
+    (normalised).
+    """
 
     raw: Number
     normalised: Number
@@ -66,7 +70,7 @@ class ConditionNumber:
 
 @dataclass(frozen=True, eq=False)
 class FilterMetrics:
-    """Sampling rate, f_q and f_v by joint, identification band f_p [Hz], and decimation factor."""
+    """Sampling rate, cutoffs f_q and f_v by joint, and identification band f_p, all in [Hz], and decimation factor."""
 
     rate: float
     cutoff: Array
@@ -83,7 +87,9 @@ class FilterMetrics:
 
 @dataclass(frozen=True, eq=False)
 class ConstraintMetrics:
-    """Constraints of an estimate, those at their bounds, and the number of postures with M(q) at its bound."""
+    """Constraints of an estimate, the constraints at their bounds, and the number of postures whose M(q) is at its
+    bound.
+    """
 
     names: tuple[str, ...]
     binding: tuple[Binding, ...]
@@ -92,15 +98,18 @@ class ConstraintMetrics:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class JudgedMetrics:
-    """Results of a model on recordings, as stored in both JSON files.
+    """Results of a model on recordings, as stored in ``metrics.json`` and ``unseen/report.json``.
 
     Attributes:
-        verdict, reason: of the model.
+        verdict, reason: level of the model's verdict, and its reason as text.
         code, advice: of the finding that decided the verdict; empty for a pass, and in files of earlier versions.
-        noticed: the findings of the warnings; other remarks on recordings and estimate are text only.
+        warnings: texts for the user.
+        noticed: findings behind the warnings; warnings without a finding are text only.
         rows: names of the torque rows.
-        tracking: by recording that was replayed; or why none was.
-        references: by unseen recording, the errors of plain references beside the model's.
+        validation: name of an unseen recording → score of the model.
+        tracking: name of a replayed recording → simulated tracking.
+        tracking_failure: reason for missing replays; empty if there are replays.
+        references: name of an unseen recording → errors of plain references beside the model's.
     """
 
     verdict: str
@@ -117,7 +126,7 @@ class JudgedMetrics:
 
 
 def _judged(assessment: DynamicsAssessment) -> FieldValues:
-    """Return the entries of an assessment common to both records, without the names of the rows."""
+    """Return the entries of an assessment common to both JSON files, without the names of the torque rows."""
     return {
         "verdict": assessment.verdict.level,
         "reason": assessment.verdict.reason,
@@ -161,9 +170,10 @@ class ModelMetrics(JudgedMetrics):
 
 
 def on_bounds(identification: Identification) -> tuple[str, ...]:
-    """Return the parameters fixed by a constraint at its bound: the data do not identify them, and they have no σ.
+    """Return the parameters fixed by a constraint at its bound: the recordings do not identify them, and they have no
+    σ.
 
-    The covariance takes the constraint as an equality: its zeros there are what the other parameters' σ rest on.
+    The covariance takes the constraint as an equality, so that the other parameters' σ assume these values to be exact.
     """
     constrained = identification.fitted.held
     if constrained is None:
@@ -214,9 +224,10 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
 
 
 def _error_density(identification: Identification, cases: Sequence[Case]) -> np.ndarray:
-    """Return the errors' density (rows,) [N² m² s or N² s]: a motion's information is ∫ ωᵀω / density dt.
+    """Return the spectral density of the torque errors (rows,) [N² m² s or N² s].
 
-    It is their variance over the independent rows per second.
+    It is the errors' variance divided by the number of independent rows per second; a motion's information is
+    ∫ ωᵀω / density dt.
     """
     count = sum(len(rows.target) for rows in identification.rows)
     per_second = count / sum(case.duration for case in cases)
@@ -225,10 +236,11 @@ def _error_density(identification: Identification, cases: Sequence[Case]) -> np.
 
 @dataclass(frozen=True, eq=False)
 class TorqueCurves:
-    """Measured and predicted torques of one recording, (rows, K) each, thinned for drawing; times [s].
+    """Measured and predicted torques of one recording, each (rows, K), thinned for drawing; times (K,) [s].
 
     Attributes:
-        band: both are low-passed to this [Hz]; NaN: they are as recorded, as earlier versions kept them.
+        name: name of the recording.
+        band: cutoff [Hz] to which both torques are low-passed; NaN in files of earlier versions: not filtered.
         error_sigma: standard error of the relative error of the torques as recorded [%].
     """
 
@@ -258,13 +270,15 @@ def _five_digits(values: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class UnseenReport(JudgedMetrics):
-    """A model on unseen motion, as ``unseen/report.json`` stores it; see `calib.procedure.dynamic_stage.identify`.
+    """Report of a model on unseen motion, content of ``unseen/report.json``; see
+    `calib.procedure.dynamic_stage.identify`.
 
     Attributes:
-        robot: its name; empty in files of earlier versions.
-        units: of the torque rows.
-        curves: of the recordings that are judged.
-        limits: (rows,) torques that the robot's description allows; infinite without one.
+        units: units of the torque rows.
+        fit: name of a training recording → score of the model.
+        curves: torques of the recordings that the model is judged by.
+        limits: (rows,) torque limits of the robot's description; infinite without a limit; None in earlier files.
+        robot: name of the robot; empty in files of earlier versions.
     """
 
     units: tuple[str, ...]
@@ -276,7 +290,7 @@ class UnseenReport(JudgedMetrics):
 
     @classmethod
     def of(cls, inputs: IdentificationInputs, assessment: DynamicsAssessment) -> UnseenReport:
-        """Return the report of an assessment."""
+        """Return the report of an assessment of `inputs`."""
         torque_rows = inputs.options.settings.torque_rows
         rows = torque_rows.titles(inputs.chain.joint_names)
         cases = inputs.unseen or inputs.cases

@@ -1,9 +1,10 @@
-"""Plain references beside an identified model: the nominal masses, and weighted least squares without any choice.
+"""Plain references beside an identified model: the nominal masses, and weighted least squares without selection.
 
-Plain weighted least squares has the base parameters with Coulomb and viscous friction and offsets, the rows and filters
-of the identification, no prior and no richer friction. Directions of unit-norm columns that the motion shows by less
-than `RANK` of the best are left out (truncated at the data's rank). Where recordings are held out, its error and that
-of the nominal masses stand beside the delivered model's: what selection and prior are worth.
+Plain weighted least squares estimates the base parameters with Coulomb and viscous friction and offsets, from the rows
+and filters of the identification, without a prior and without richer friction. Directions of unit-norm columns with a
+singular value below `RANK` of the largest are omitted (truncated at the data's rank). On held-out recordings, the
+errors of this estimate and of the nominal masses are shown beside the delivered model's error: the difference shows
+the benefit of selection and prior.
 """
 
 from __future__ import annotations
@@ -35,12 +36,12 @@ BODY_PARAMETERS = 10
 
 @dataclass(frozen=True)
 class PlainReferences:
-    """Torque unexplained on a recording that was held out [%], all as `Score.judged`.
+    """Unexplained share of the torque of a held-out recording [%], each computed as `Score.judged`.
 
     Attributes:
         delivered: by the identified model.
         plain: by plain weighted least squares; NaN where none was possible.
-        nominal: by the masses of the robot's description, without friction; NaN without masses, or of currents.
+        nominal: by the masses of the robot's description, without friction; NaN without masses, or for currents.
     """
 
     delivered: Number
@@ -74,7 +75,7 @@ def truncated(data: Triangles) -> np.ndarray:
     """Return the weighted least-squares values (p,) of least norm, truncated at the data's rank.
 
     Args:
-        data: R factors, one group per torque row, each weighed by its residuals.
+        data: R factors, one group per torque row; each group is weighted by the inverse rms of its residuals.
     """
     weight, values = np.ones(data.groups), np.zeros(data.parameters)
     for _ in range(ROUNDS):
@@ -90,9 +91,9 @@ def truncated(data: Triangles) -> np.ndarray:
 
 
 def nominal_values(chain: Chain, dynamics: Dynamics[RegressorModel]) -> np.ndarray | None:
-    """Return the model's parameters (p,) by the robot's description, without friction.
+    """Return the model's parameters (p,) from the masses of the robot's description, without friction.
 
-    None where it states no masses, or the torques are drives' alone, which hold no bodies.
+    None if the description states no masses, or if the torque rows are those of drives alone, without rigid bodies.
     """
     inertias = getattr(chain, "inertias", None)
     if inertias is None or not np.any(inertias[:, 9] > 0.0) or not dynamics.model.torque_rows.has_bodies:
@@ -111,15 +112,16 @@ def references(
     slow: float | tuple[float, ...] | None = None,
     apart: Sequence[int] = (),
 ) -> dict[str, PlainReferences]:
-    """Return the errors of plain references on held-out recordings beside the model's.
+    """Return the errors of plain references on held-out recordings beside the model's: recording name → errors.
 
     Args:
-        cases: held out.
-        scores: of the model on them.
-        plain: (p,) parameters by plain least squares; empty where there are none.
-        nominal: (p,) by the description; None without.
-        slow: what stands, see `calib.data.signals.motion.moving`.
-        apart: rows in a unit of their own, which no total holds.
+        cases: held-out recordings.
+        scores: recording name → score of the model.
+        dynamics: the model.
+        plain: (p,) parameters by plain least squares; empty without such an estimate.
+        nominal: (p,) parameters by the description; None without.
+        slow: speed below which a joint counts as standing, see `calib.data.signals.motion.moving`; None: its default.
+        apart: indices of rows with a unit of their own, which are excluded from totals.
     """
     result = {}
     for case in cases:
@@ -138,7 +140,7 @@ def references(
 def _unexplained(
     case: Case, predicted: np.ndarray, in_motion: bool, slow: float | tuple[float, ...] | None, apart: Sequence[int]
 ) -> float:
-    """Return 100 ‖τ - τ̂‖ / ‖τ‖ [%] of a case, of joints in motion alone if asked."""
+    """Return the unexplained share 100 ‖τ - τ̂‖ / ‖τ‖ [%] of a case; with `in_motion`, of moving joints only."""
     motion = case.motion
     rows = case.target.shape[1]
     counted = np.repeat(motion.weight[:, None] > 0.5, rows, axis=1)
@@ -152,7 +154,9 @@ def _unexplained(
 
 
 def worse_than_plain(errors_by_file: Mapping[str, PlainReferences]) -> list[Finding]:
-    """Return the finding on the held-out recording where plain least squares beats the model most, if it does."""
+    """Return the finding on the held-out recording where plain least squares is most ahead of the model; [] if
+    nowhere.
+    """
     ratios = {}
     for name, errors in errors_by_file.items():
         if np.isfinite(errors.plain) and errors.plain > 0.0:

@@ -1,7 +1,7 @@
-"""Findings on sizes, signs and clocks of recordings (catalogue, chapter 9).
+"""Findings on implausible sizes, signs and clocks of recordings (findings catalogue, chapter 9).
 
-The limits and sentences stand there. A finding that makes the numbers of a model wrong by far fails the verdict, or
-holds it at marginal, until the options' ``accept`` says that it is intended.
+The catalogue states their limits and sentences. A finding that makes the numbers of a model wrong by far fails the
+verdict, or limits it to marginal, unless the options' ``accept`` names the finding as intended.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -67,7 +67,7 @@ def implausible(
 
 
 def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Finding]:
-    """Return the findings on implausible recordings."""
+    """Return the findings on implausible recordings, from the sizes of their torques, velocities and clocks."""
     result: list[Finding] = []
     for recording in sizes:
         result += _limits(recording, joints)
@@ -95,12 +95,14 @@ def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Fin
 
 
 def _of_some_level(candidates: Iterable[Finding]) -> list[Finding]:
-    """Return the findings that reach a level of the catalogue."""
+    """Return the findings whose values reach a level (warning or verdict) of the catalogue."""
     return [candidate for candidate in candidates if level_of(candidate)]
 
 
 def standing_columns(cases: Sequence[Case], joints: Sequence[str]) -> list[Finding]:
-    """Return the findings on clipped torques, and on positions and velocities that stand while their joint moves."""
+    """Return the findings on clipped torques, and on positions and velocities that stay constant while a joint
+    moves.
+    """
     result = []
     for case in cases:
         clipped, values = [], []
@@ -159,7 +161,7 @@ def _joints_of_change(change: Change) -> tuple[int, ...]:
 
 
 def impossible(contradiction: Contradiction | None) -> list[Finding]:
-    """Return the finding that an estimate is far from every physically consistent robot."""
+    """Return the finding that an estimate is far from every physically consistent robot; [] if it is not or unknown."""
     if contradiction is None:
         return []
     candidate = finding(
@@ -179,7 +181,9 @@ def described(chain: Chain) -> list[Finding]:
 
 
 def another_loop(disagreement: LoopDisagreement | None) -> list[Finding]:
-    """Return the finding that recorded torques contradict an estimate based on the given control loop."""
+    """Return the finding that recorded torques contradict an estimate based on the given control loop; [] if they do
+    not.
+    """
     if disagreement is None:
         return []
     factors, median = np.array(disagreement.factor), float(np.median(disagreement.factor))
@@ -225,7 +229,7 @@ def _masses(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Findin
 
 
 def _off(ratio: np.ndarray | np.floating) -> float:
-    """Return the largest factor by which one of several ratios differs from 1."""
+    """Return the largest factor max(|r|, 1/|r|) by which any of the ratios r differs from 1."""
     sizes = np.maximum(np.abs(ratio), 1e-300)
     return float(np.maximum(sizes, 1.0 / sizes).max())
 
@@ -251,7 +255,7 @@ def _limits(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Findin
 
 
 def _speed(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
-    """Compare measured velocities with the differentiated positions."""
+    """Yield the findings on measured velocities whose size differs from the differentiated positions."""
     ratio = recording.speed
     measured = np.flatnonzero(np.isfinite(ratio))
     median = float(np.median(ratio[measured])) if len(measured) else 1.0
@@ -283,7 +287,9 @@ def _speed(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding
 
 
 def _against(clock: ClockRatio | None, speed_ratio: float) -> str:
-    """Return ``stamps`` or ``velocities``: whichever disagrees with the ratio of inertias to masses; "" if neither."""
+    """Return which measurement contradicts the ratio of inertias to masses: ``stamps`` or ``velocities``; "" if
+    neither.
+    """
     if clock is None:
         return ""
     stamps_error = abs(float(np.log(clock.ratio)))
@@ -309,7 +315,7 @@ def _unlike(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Findin
 
 
 def _lag(name: str, lag: Lag | None, joints: Sequence[str]) -> Iterator[Finding]:
-    """Yield the findings on torques that are late at all joints, and at one joint."""
+    """Yield the findings on torques that are delayed at all joints, or at one joint."""
     if lag is None:
         return
     if lag.certain:
@@ -342,7 +348,7 @@ def _direction(seconds: float) -> str:
 
 
 def _clock(name: str, clock: ClockRatio | None) -> Iterator[Finding]:
-    """Yield the finding on stamps that contradict the ratio of inertias to masses."""
+    """Yield the finding on time stamps that contradict the ratio of inertias to masses."""
     if clock is None:
         return
     times = _off(np.float64(clock.ratio))

@@ -31,10 +31,10 @@ class FoundGains:
     """Drive gains that convert currents to torques.
 
     Attributes:
-        options: the options, with payload parameters identified together with the gains.
-        gains: (n,) for recordings without stated gains; None if not needed.
-        found: the identification of gains; None without one.
-        unit: of the torques.
+        options: the options, with payload parameters that were identified together with the gains.
+        gains: (n,) gains for recordings without stated gains; None if not needed.
+        found: the identification of the gains; None if they were not identified.
+        unit: unit of the converted torques.
         notes: remarks for the user.
     """
 
@@ -50,7 +50,9 @@ class FoundGains:
         return () if self.found is None else self.found.own
 
     def for_motion(self, motion: Motion, options: FileSettings) -> np.ndarray | None:
-        """Return the gains (n,) for a motion, from options, identification or file; None for torques."""
+        """Return the gains (n,) for a motion, from options, identification or file; None if it has torques, not
+        currents.
+        """
         if options.gains is not None:
             if len(options.gains) not in (1, motion.n):
                 raise UsageError(f"gains: {len(options.gains)} values for {motion.n} joints ({motion.file})")
@@ -67,7 +69,15 @@ def find_gains(
     training: Sequence[str],
     say: Callable[[str], None],
 ) -> FoundGains:
-    """Return the drive gains that convert the currents of `motions` (path → motion) to torques."""
+    """Return the drive gains that convert the currents of `motions` (path → motion) to torques.
+
+    Args:
+        chain: the arm.
+        options: options of the identification; a stated pair of recordings with a known payload determines the gains.
+        motions: path → motion of all recordings.
+        training: paths of the training recordings, from which relative gains are identified.
+        say: called with the name of each step.
+    """
     if options.gain_pair is not None:
         say("drive gains")
         return _from_pair(chain, options, options.gain_pair, motions)
@@ -88,7 +98,7 @@ def find_gains(
 
 
 def _from_pair(chain: Chain, options: IdentifyOptions, pair: GainPair, motions: Mapping[str, Motion]) -> FoundGains:
-    """Return the drive gains in N m from recordings without and with a payload of known mass."""
+    """Return the absolute drive gains, identified from recordings without and with a payload of known mass."""
     settings = options.settings
     known_values = {f"M{label}": load.mass for label, load in settings.payloads.items() if load.mass is not None}
     for label, load in settings.payloads.items():
@@ -117,7 +127,7 @@ def _from_pair(chain: Chain, options: IdentifyOptions, pair: GainPair, motions: 
 
 
 def _relative(chain: Chain, options: IdentifyOptions, currents: Sequence[tuple[str, Motion]]) -> FoundGains:
-    """Return the drive gains relative to the joint with the largest current; all torques are then in its amperes."""
+    """Return the drive gains relative to the joint with the largest current, so that all torques are in its amperes."""
     if not currents:
         return FoundGains(options, None, None, "A", ("drive gains are unknown: torques are currents [A]",))
     cases = [make_case(path, motion, carried=options.file_settings(path).payload) for path, motion in currents]
@@ -174,7 +184,7 @@ def _identify(
 def _case(
     name: str, chain: Chain, options: IdentifyOptions, motions: Mapping[str, Motion], carried: tuple[str, ...]
 ) -> Case:
-    """Return the case of currents, from a given recording or from a file in the folder of the options file."""
+    """Return the case of a recording of currents: one of `motions`, or a file in the folder of the options file."""
     file = parse_cut(name)[0]
     for path, motion in motions.items():
         if path == name or Path(parse_cut(path)[0]).name == file:
@@ -192,7 +202,7 @@ def _case(
 
 
 def _poor_gains(gains: DriveGains) -> list[str]:
-    """Return a note on gains with a large sigma; empty without."""
+    """Return a note on gains with a large σ; [] if there are none."""
     joints = []
     for j, (gain, sigma) in enumerate(zip(gains.gains, gains.sigma)):
         if sigma > MAX_GAIN_SIGMA * abs(gain):

@@ -1,24 +1,25 @@
 """Benefit of the model as feedforward in a controller: simulated tracking errors on recorded motion.
 
-Nobody has the real robot here, so the simulated one is made to need the torque that was measured: it is the identified
-model, and what that model left unexplained along the recording is replayed on it as a disturbance,
+Without the real robot, a simulated one is used that needs the measured torque: it is the identified model, and the
+torque that the model left unexplained along the recording acts on it as a disturbance,
 
-    M(q) a + … = tau + (tau_model(q_r, v_r, a_r) - tau_measured),    tau = feedback + ahead,
+    M(q) a + … = tau + (tau_model(q_r, v_r, a_r) - tau_measured),    tau = feedback + feedforward,
 
-with the recorded motion (filtered) as the reference. A robot that stays on it needs tau = tau_measured. Fed forward
-are: nothing; the robot's own inertias (CAD), without friction; the identified model in full; and, as the floor that the
-control period leaves, the measured torque itself. So the model is not excused by being its own robot: on motion that it
-was not fitted to, all of its error disturbs it. What this cannot show: disturbances that would change with the path
-(they are replayed by the clock), elastic joints, and what the real controller has besides. The noise of the torque
-sensors is replayed too, as if it pushed; feedback swallows most of it.
+with the recorded motion (filtered) as the reference. A robot that follows the reference needs tau = tau_measured. The
+feedforwards compared are: none; the robot's own inertias (CAD), without friction; the complete identified model; and
+the measured torque itself, whose error is the least that the control period allows. On motion that the model was not
+fitted to, its whole error acts as the disturbance, although the simulated robot is the model. The simulation does not
+contain disturbances that depend on the path (they are replayed by time), elastic joints, and further functions of the
+real controller. The noise of the torque sensors is replayed as a disturbance; feedback suppresses most of it.
 
-Real estimates are often no possible robots (a small wrist inertia comes out below zero). Then as much motor inertia is
-added to the simulated robot as it needs, and told; along the reference the disturbance takes it off again, so only how
-fast the feedback reacts depends on it. Signs too steep for so little inertia are smoothed over more speed, likewise.
+Estimates are often physically inconsistent (a small wrist inertia is negative). Then the least sufficient motor inertia
+is added to the simulated robot and reported; along the reference the disturbance compensates it, so that it affects
+only how fast the feedback reacts. Likewise, sign functions too steep for so little inertia are smoothed over more
+speed.
 
-Without a stated controller: PD of `FREQUENCY`, damping `DAMPING`, on the model's mean inertia, as slow as robots come,
-so that the model's part shows. All of this is our choice; the judgement itself is that of Kolyubin, Shiriaev & Jubien
-(2019, section 7), who miss it.
+Without a stated controller: PD with `FREQUENCY` and damping `DAMPING` on the model's mean inertia, as slow as robots'
+controllers are, so that the model's effect is visible. All of this is our choice; the criterion, tracking error with
+feedforward, is that of Kolyubin, Shiriaev & Jubien (2019, section 7).
 """
 
 from collections.abc import Mapping
@@ -59,17 +60,20 @@ def replay(
     controller: LoopController | None = None,
     rate: float | None = None,
 ) -> Replay:
-    """Return the tracking errors on a recorded motion with three feedforwards: none, the CAD model, and the model.
+    """Return the tracking errors on a recorded motion with the feedforwards none, CAD model, model, and measured
+    torque.
 
     Args:
-        chain: whose inertias are the CAD's, where it has any.
-        dynamics: the identified model, of motor torques (or of both).
-        predicted: (N, rows) its torques along the case.
-        controller: the feedback; None: the default. Torques it adds by itself are not taken.
-        rate: of the controller [Hz]; None: see `calib.identification.closed_loop.loop_recordings.periods_per_sample`.
+        chain: arm with the CAD's inertias, if it has any.
+        dynamics: the identified model, of motor torques (or of motor and link torques).
+        case: the recording.
+        predicted: (N, rows) torques of the model along the case.
+        controller: the feedback, without its own feedforward torques; None: the default.
+        rate: rate of the controller [Hz]; None: see
+            `calib.identification.closed_loop.loop_recordings.periods_per_sample`.
 
     Raises:
-        CalibError: where the rows are not the motors', or the loop is unstable.
+        CalibError: if the torque rows are not those of the motors, or the loop is unstable.
     """
     model = dynamics.model
     n = chain.n
@@ -110,7 +114,9 @@ def _stretch(case: Case) -> slice:
 
 
 def _robot(dynamics: Dynamics, case: Case) -> tuple[Plant, tuple[str, ...]]:
-    """Return the model as a robot with the case's payloads, and the names of terms that cannot be simulated."""
+    """Return the model as a simulated robot with the case's payloads, and the names of terms that cannot be
+    simulated.
+    """
     model = dynamics.model
     bodies, drives = dynamics.values[: model.inertial], dynamics.values[model.inertial :]
     terms, values, omitted = [], [], []
@@ -125,7 +131,9 @@ def _robot(dynamics: Dynamics, case: Case) -> tuple[Plant, tuple[str, ...]]:
 
 
 def _reference(part: Case, rate: float | None) -> tuple[Reference, float]:
-    """Return the recorded motion as a reference at the control rate, and the control periods per sample."""
+    """Return the recorded motion as a reference at the control rate [Hz], and the number of control periods per
+    sample.
+    """
     motion = part.motion
     periods = periods_per_sample(motion, rate)
     samples = np.arange(len(motion))
@@ -138,7 +146,7 @@ def _reference(part: Case, rate: float | None) -> tuple[Reference, float]:
 def _with_inertia(robot: Plant, reference: Reference) -> tuple[Plant, np.ndarray]:
     """Return the robot with motor inertia added until M(q) is positive definite, and the added inertia (n,).
 
-    The least eigenvalue of its inertia matrix along the reference, scaled by its diagonal, becomes `MIN_EIGENVALUE`.
+    The least eigenvalue of M(q) along the reference, scaled by its diagonal, is raised to `MIN_EIGENVALUE`.
     """
     inertia = robot.inertia(reference.q[::50])
     diagonal = np.abs(np.einsum("kii->i", inertia)) / len(inertia)
@@ -156,7 +164,7 @@ def _with_inertia(robot: Plant, reference: Reference) -> tuple[Plant, np.ndarray
 
 
 def _smoothed(term: DriveTerm, value: float, size: np.ndarray, reference: Reference) -> DriveTerm:
-    """Return a drive term whose sign function is smooth enough to integrate at this control period."""
+    """Return a drive term whose sign function is smooth enough to integrate at the control period of `reference`."""
     if "v0" not in term.form.settings:
         return term
     min_v0 = MIN_SMOOTHING * abs(value) * reference.period / size[term.acts[0][0]]
@@ -176,11 +184,15 @@ def track(
     predictions: Mapping[str, np.ndarray],
     controller: LoopController | None = None,
 ) -> tuple[dict[str, Replay], str]:
-    """Return the replays by name, of unseen recordings or else of a training recording, or the reason for none.
+    """Return the replays by recording, of unseen recordings or else of a training recording, and the reason if there
+    are none.
 
     Args:
-        predictions: case name → torques by the model.
-        controller: that was identified, where the loop's is not stated.
+        inputs: recordings and options; without a [loop] in the options, the default controller is used.
+        dynamics: the model.
+        predictions: name of a recording → torques by the model.
+        controller: the identified controller, used if the options let the controller be identified; None: not
+            identified.
     """
     chain = inputs.chain
     loop = inputs.options.settings.loop

@@ -47,9 +47,9 @@ class Resting:
     """Base parameters whose values are determined by a prior, not by the motion.
 
     Attributes:
-        names: theirs.
-        of: how many base parameters there are.
-        source: of the prior: ``cad`` or ``sizes``; empty where there was none.
+        names: names of these parameters.
+        of: number of all base parameters.
+        source: source of the prior: ``cad`` or ``sizes``; empty without a prior.
     """
 
     names: tuple[str, ...] = ()
@@ -58,7 +58,7 @@ class Resting:
 
     @property
     def origin(self) -> str:
-        """Source of their values, as text."""
+        """Source of the prior's values, as text."""
         return "CAD values" if self.source == "cad" else "typical magnitudes of such parameters"
 
 
@@ -72,16 +72,20 @@ def judge(
 ) -> tuple[str, list[Finding]]:
     """Return the torque errors on unseen motion as a sentence, and the findings that worsen the verdict.
 
-    Recordings in which the robot stands are left aside. Of the sum over joints the worst of the findings
-    ``motion-poor``, ``torque-unexplained``, ``training-torque-unexplained``, ``no-torque-transfer``, of equals the
-    first; without unseen motion why there is none. Then ``joints-unexplained``, since a total hides small joints.
+    Recordings in which the robot stands are ignored. The first list entry is the worst finding on the error of all
+    joints
+    together, among ``motion-poor``, ``torque-unexplained``, ``training-torque-unexplained`` and ``no-torque-transfer``
+    (the
+    first of equals), or, without unseen motion, the reason why there is none. ``joints-unexplained`` follows, since a
+    total
+    hides small joints.
 
     Args:
-        fit, validation: scores by file; validation without repeats.
-        repeated: validation files that repeat the training motion.
-        excitation: of the training files.
-        rows: what the torque rows are called, see `calib.dynamics.torque_rows.TorqueRows.numbered`; default 1, 2, ...
-        coordinate: what such a row belongs to, in a word.
+        fit, validation: scores by recording; validation without repeats of the training motion.
+        repeated: unseen recordings that repeat the training motion → share of their states found in the training.
+        excitation: name of a training recording → report on its motion.
+        rows: names of the torque rows, see `calib.dynamics.torque_rows.TorqueRows.numbered`; default 1, 2, ...
+        coordinate: noun for what a torque row belongs to.
     """
     moving = {name: score for name, score in validation.items() if score.motion_share >= MOVES}
     training_error = max((score.judged.total for score in fit.values()), default=np.nan)
@@ -115,13 +119,15 @@ def judge(
 
 
 def friction_drives(joints: Iterable[object], payload: str = "") -> list[Finding]:
-    """Return the finding that friction of joints adds energy; `payload`: label of a possible payload."""
+    """Return the finding that friction of joints adds energy, [] without joints; `payload`: label of a possible
+    payload.
+    """
     names = list(map(str, joints))
     return [finding("friction-drives", joints=names, payload=payload)] if names else []
 
 
 def with_duration(verdict: Verdict, excitation: Mapping[str, ExcitationReport]) -> Verdict:
-    """Return the verdict; unless it is pass, its reason begins with a training motion that is too short."""
+    """Return the verdict; if it is not pass and the training motion is too short, its reason begins with this cause."""
     seconds = sum(report.seconds for report in excitation.values())
     if verdict.level == "pass" or not excitation or seconds >= MIN_MOTION:
         return verdict
@@ -132,7 +138,8 @@ def with_duration(verdict: Verdict, excitation: Mapping[str, ExcitationReport]) 
 def _joints(scores: Mapping[str, Score], rows: Sequence[str], coordinate: str) -> list[Finding]:
     """Return the finding on joints whose torque the model does not explain.
 
-    Taken in the band, since noise is no fault of the model, and moving, since friction at rest takes any value.
+    The error is taken in the identification band, since noise is not an error of the model, and while the joint moves,
+    since friction at rest can take any value.
     """
     threshold = limit("joints-unexplained", "worst", "marginal")
     unexplained: dict[int, float] = {}
@@ -158,8 +165,8 @@ def too_narrow(expected: Mapping[str, TorqueIntervals], rows: Sequence[str]) -> 
     """Return the finding on the first unseen recording with errors outside their intervals more often than by chance.
 
     Args:
-        expected: by unseen case.
-        rows: what the torque rows are called.
+        expected: name of an unseen recording → intervals of its torque errors.
+        rows: names of the torque rows.
     """
     for name, intervals in expected.items():
         sigma = np.sqrt((1.0 - COVERED) * COVERED / np.maximum(intervals.independent, 1.0))
@@ -172,7 +179,7 @@ def too_narrow(expected: Mapping[str, TorqueIntervals], rows: Sequence[str]) -> 
 
 
 def extrapolates(name: str, expected: TorqueIntervals | None) -> list[Finding]:
-    """Return the finding on a recording whose motion leaves the training range."""
+    """Return the finding on a recording whose motion leaves the training range; [] if it does not, or if unknown."""
     if expected is None:
         return []
     share = float(expected.beyond.mean())
@@ -184,7 +191,7 @@ def extrapolates(name: str, expected: TorqueIntervals | None) -> list[Finding]:
 
 
 def with_prior(verdict: Verdict, rests: Resting) -> Verdict:
-    """Return the verdict, with a remark if most parameters come from a prior instead of the motion."""
+    """Return the verdict, with a remark if most parameters are determined by a prior instead of the motion."""
     if 2 * len(rests.names) <= rests.of:
         return verdict
     remark = finding("mostly-prior", count=len(rests.names), parameters=rests.of, source=rests.origin)
@@ -192,7 +199,9 @@ def with_prior(verdict: Verdict, rests: Resting) -> Verdict:
 
 
 def motion_findings(validation: Mapping[str, Score], repeated: Mapping[str, float]) -> list[Finding]:
-    """Return the findings on the motion of recordings, for any robot."""
+    """Return the findings on recordings that repeat the training motion, or in which the robot stands; for any
+    robot.
+    """
     findings = [finding("repeats-training", file=name, share=share) for name, share in repeated.items()]
     standing = [name for name, score in validation.items() if score.motion_share < MOVES]
     findings += [finding("stands", file=name) for name in standing]
@@ -264,7 +273,7 @@ def resting_parameters(identification: Identification[RegressorModel]) -> Restin
 
 
 def _negative(identification: Identification[RegressorModel]) -> list[Finding]:
-    """Return the finding on drive inertias and friction that are negative by more than `SURELY` sigmas."""
+    """Return the finding on drive inertias and friction parameters that are negative by more than `SURELY` σ."""
     estimate = identification.fitted.estimate
     names = []
     for name, term, value, sigma in zip(identification.names, identification.terms, estimate.values, estimate.sigma):
@@ -274,7 +283,7 @@ def _negative(identification: Identification[RegressorModel]) -> list[Finding]:
 
 
 def _unmodelled(identification: Identification) -> list[Finding]:
-    """Return the finding on joints with autocorrelated residuals, whose sigmas are valid for this motion only."""
+    """Return the finding on joints with autocorrelated residuals, whose σ are valid for this motion only."""
     inflation = np.nan_to_num(identification.fitted.inflation)
     rows = identification.settings.torque_rows.numbered(identification.dynamics.model.n)
     correlated = np.flatnonzero(inflation >= MAX_CORRELATED_ROWS)

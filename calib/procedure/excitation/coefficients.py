@@ -100,9 +100,13 @@ class Periodic:
     """A periodic motion, defined by its coefficients: eq. 23 of Kolyubin et al. 2019, or control points.
 
     Attributes:
-        joint_names, kinds: n names, and types (revolute, prismatic).
-        period: [s]; rate: of the controller [Hz]; repeat: periods that were to be run.
-        kind: of the family; coefficients: per joint; degree: of splines.
+        joint_names, kinds: names (n) and types (revolute, prismatic) of the joints.
+        period: duration of a period [s].
+        rate: rate of the controller [Hz].
+        repeat: planned number of periods.
+        kind: family of motions: fourier or bspline.
+        coefficients: per joint, q0, a, b of a Fourier series, or control points of a spline.
+        degree: degree of splines.
     """
 
     joint_names: tuple[str, ...]
@@ -183,7 +187,7 @@ def read(folder: Path) -> Periodic:
 
 
 def _spline_points(content: TrajectoryFile, path: Path) -> list[np.ndarray]:
-    """Return the control points of each joint."""
+    """Return the control points of each joint's spline; refuse a joint without points."""
     coefficients = []
     for number, joint in enumerate(content.joint, 1):
         if joint.points is None:
@@ -193,7 +197,7 @@ def _spline_points(content: TrajectoryFile, path: Path) -> list[np.ndarray]:
 
 
 def _fourier_coefficients(content: TrajectoryFile, path: Path) -> list[np.ndarray]:
-    """Return q0, a, b of each joint in a row; all joints have as many harmonics."""
+    """Return [q0, a, b] of each joint as one array; refuse joints with different numbers of harmonics."""
     count = len(content.joint[0].a or ())
     coefficients = []
     for number, joint in enumerate(content.joint, 1):
@@ -211,12 +215,13 @@ class AveragedMotion:
     """Average of the periods of a designed motion in a log.
 
     Attributes:
-        motion: that was looked for; file: the log.
-        found: where it was.
+        motion: the designed motion.
+        file: the log.
+        found: samples of the log that contain the motion.
         averages: series of the recording (q, effort, v, ...) → mean and variance over the periods.
-        kind: of the effort, torque or current.
-        rate: [Hz]; a period holds a whole number of samples.
-        following: (n,) rms of measured minus commanded positions, after the best shift of whole samples [rad or m].
+        kind: kind of the effort: torque or current.
+        rate: sampling rate [Hz]; a period has a whole number of samples.
+        following: (n,) rms of measured minus commanded positions, after the best shift by whole samples [rad or m].
     """
 
     motion: Periodic

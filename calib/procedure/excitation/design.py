@@ -1,4 +1,4 @@
-"""Designing exciting motions: the package `trajectories` gets a robot's regressor and limits."""
+"""Design of exciting motions: passes a robot's regressor and limits to the package `trajectories`."""
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -38,7 +38,9 @@ from calib.workers import finishing
 class DesignCondition:
     """Condition numbers of the observation matrix: raw (SI units), and normalised (columns of unit norm).
 
-    Where motions before count, too: of this motion alone, and of those before it.
+    With earlier motions, `raw` and `normalised` are those of all motions together, `…_alone` those of the new motion,
+    and
+    `…_before` those of the earlier motions; None without earlier motions, or where the columns are not all determined.
     """
 
     raw: float
@@ -67,16 +69,19 @@ class Designed:
     """A designed exciting motion, with its inputs, goals reached, and verified margins to the limits.
 
     Attributes:
-        inputs, settings: of the design.
-        problem: that was solved last, with the family of motions.
-        found: the motion; `proof`: its margins, checked independently.
-        condition: raw and normalised, of `INSTANTS` samples over the period with the model's own Coulomb sign.
-        goals: the stated ones: name, number asked for, weight, and number reached (by `exact` of the inputs' model).
-        front: trade-offs, where asked for.
-        playback: what a controller is to run.
-        notes: what a user should know.
-        outlook: what the motion is predicted to identify; None where no torque limits say how large errors are.
-        predicted: sigmas of the parameters; empty there.
+        inputs, settings: inputs and settings of the design.
+        problem: optimisation problem that was solved last, with the family of motions.
+        found: the motion.
+        proof: margins of the motion to the limits, checked independently.
+        condition: condition numbers at `INSTANTS` samples over the period, without additional smoothing of Coulomb
+            friction.
+        goals: stated goals: name, requested value, weight, and reached value (by `exact` of the inputs' model).
+        front: trade-offs between goals; None if not requested.
+        playback: setpoints for the controller.
+        notes: remarks for the user.
+        outlook: prediction of what the motion identifies; None without torque limits, from which torque errors are
+            assumed.
+        predicted: predicted σ of the parameters; empty without `outlook`.
     """
 
     inputs: ExcitationInputs
@@ -123,21 +128,27 @@ def excite(
 ) -> Designed:
     """Design a motion that excites the dynamics of a robot within its limits.
 
-    Without goals the logarithms of both condition numbers, raw and normalised, are minimised in equal parts, or an aim
-    such as ``logdet`` alone. With goals (``wrist=0.1``) both take part with what a single-objective run reached as
-    their goal (the study's advice), unless they are given themselves.
+    Without goals, the logarithms of both condition numbers, raw and normalised, are minimised with equal weights; an
+    aim
+    such as ``logdet`` replaces them. With goals (``wrist=0.1``), the condition numbers become goals, too: their goal
+    values
+    are those reached by a first single-objective search (the study's advice), unless the settings state them.
 
     Args:
         robot, base, tip: see `calib.robot.library`.
         settings: see `calib.procedure.excitation.settings`.
         model: folder of an identification: torques, friction and their uncertainty.
         limits: see `calib.procedure.excitation.limits`.
-        options: of the identification that will follow: torque rows, drive terms, payloads.
-        after: folder of an identification that the motion shall add to; replaces `model`.
-        map: where the starts of the search run (`calib.workers`).
-        progress: called with words.
+        options: options of the identification that will follow: torque rows, drive terms, payloads.
+        after: folder of an identification whose recordings the motion shall complement; replaces `model`.
+        map: function that runs the starts of the search, possibly in parallel (`calib.workers`).
+        progress: called with the name of each step; None: silent.
 
     Ctrl-C ends the search; the best motion found so far is verified and returned.
+
+    Raises:
+        UsageError, MeasurementError: for a file that cannot be read, or belongs to another robot.
+        NothingFeasible: if no motion within the limits was found.
     """
     inputs = read_inputs(robot, settings, model, limits, base, tip, options, after)
     try:
@@ -153,7 +164,7 @@ def _silent(stage: str) -> None:
 def search_motion(
     inputs: ExcitationInputs, settings: ExcitationSettings, map: Callable = map, progress: Progress | None = None
 ) -> Designed:
-    """Search for an exciting motion of an arm, or of the platform's coordinates of a parallel robot."""
+    """Search for an exciting motion of an arm, or, for a parallel robot, of the platform's coordinates."""
     show = progress or _silent
 
     def report(number: int, total: int, stage: str) -> None:
@@ -218,7 +229,9 @@ def search_motion(
 def _reached(
     problem: ExcitationProblem, goals: Sequence[AttainmentGoal], result: SearchResult, inputs: ExcitationInputs
 ) -> tuple[float, ...]:
-    """Return the goals' values of a motion at `INSTANTS`, with the model's own Coulomb sign."""
+    """Return the goals' values (one per goal) that a motion reaches at `INSTANTS`, without smoothing of Coulomb
+    friction.
+    """
     if not goals:
         return ()
     motion = dense_motion(problem.family, result.x, _instants(problem.family, result), result.factor)
@@ -242,7 +255,9 @@ def _instants(family: Family, motion: SearchResult) -> np.ndarray:
 def _excitation_problem(
     inputs: ExcitationInputs, settings: ExcitationSettings
 ) -> tuple[ExcitationProblem, tuple[MotionConstraint, ...], tuple[str, ...]]:
-    """Return the optimisation problem (condition numbers, limits), the constraints to verify, and notes."""
+    """Return the optimisation problem (objectives, limits, family), the constraints to verify, and notes for the
+    user.
+    """
     constraints, checked, notes = _constraints(inputs.model, inputs.limits)
     condition = _condition_objective(inputs, settings)
     objectives = objectives_of(settings, condition, inputs)
@@ -286,7 +301,9 @@ def _condition_objective(inputs: ExcitationInputs, settings: ExcitationSettings)
 def _searched(
     problem: ExcitationProblem, goals: Sequence[AttainmentGoal], starts: int, search: Search, show: Progress
 ) -> tuple[SearchResult, ExcitationProblem]:
-    """Return the motion and the problem solved; a first search sets the goals of the condition numbers."""
+    """Return the motion and the problem solved; if goals need it, a first search sets the condition numbers' goal
+    values.
+    """
     has_condition_goal = any(isinstance(goal.objective, Excitation) for goal in goals)
     if not goals or has_condition_goal:
         problem = replace(problem, goals=tuple(goals))
@@ -311,7 +328,9 @@ def _searched(
 def _condition_of(inputs: ExcitationInputs, family: Family, result: SearchResult, repeat: int = 1) -> DesignCondition:
     """Return the condition numbers at `INSTANTS` samples over the period, without smoothing of Coulomb friction.
 
-    With motions before they are those of all motions together; ``alone`` and ``before`` say what each has by itself.
+    With earlier motions they are those of all motions together; `…_alone` and `…_before` are those of the new motion
+    and
+    of the earlier motions by themselves.
     """
     columns = inputs.columns
     motion = dense_motion(family, result.x, _instants(family, result), result.factor)
@@ -340,7 +359,9 @@ def _finite(condition: float) -> float | None:
 
 
 def _family(inputs: ExcitationInputs, settings: ExcitationSettings) -> tuple[Family, Family | None]:
-    """Return the family of motions, and for the first search stage a family of fewer harmonics or None."""
+    """Return the family of motions, and the family with fewer harmonics for the first search stage; None without
+    one.
+    """
     fixed = {j: value for j, value in inputs.locked.items() if value is not None}
     resonance, harmonics = inputs.limits.resonance, settings.harmonics
     if harmonics is None:
@@ -402,7 +423,10 @@ def _nearest_goals(
     designed: tuple[SearchResult, Verification],
     checked: tuple[MotionConstraint, ...],
 ) -> tuple[Front, SearchResult, Verification]:
-    """Return the front, and of its motions and the designed one that which comes nearest to the goals, verified."""
+    """Return the front, and the motion nearest to the goals, verified, among the front's motions and the designed one.
+
+    Without goals, the designed motion is returned.
+    """
 
     def distance(motion: SearchResult) -> float:
         return merit(problem, np.array(_reached(problem, goals, motion, inputs)))
@@ -428,9 +452,12 @@ def _front(
     evaluations: int,
     report: Callable[[int, int, str], None],
 ) -> Front:
-    """Return trade-offs by the ε-constraint: the first torque goal (default: wrist) from idle to its best value.
+    """Return the trade-offs by the ε-constraint method: torque goal from rest to its best value, versus condition
+    number.
 
-    Against it stands the condition number among the goals; default the normalised one, or the aim.
+    The torque goal is the first one stated (default: wrist); the condition number is the first among the goals
+    (default:
+    the normalised one, or the aim).
     """
     slacks = [goal.objective for goal in goals if isinstance(goal.objective, TorqueSlack)]
     slack = slacks[0] if slacks else torque_slack(wrist(inputs.chain.n), inputs, "front")

@@ -37,11 +37,12 @@ class ExcitedModel:
     """The dynamic model to excite, with known parameter values to predict torques.
 
     Attributes:
-        smooth: base model with the Coulomb sign smoothed for the search; `exact` with the model's own smoothing.
-        values: (b,) base parameters; None where neither a model nor inertias are known.
-        covariance: (b, b) or None.
-        friction: whether friction is among the values.
-        notes: what a user should know.
+        smooth: base model with a smoothed sign function of Coulomb friction, for the search.
+        exact: base model with the identification's own sign function.
+        values: (b,) base parameters; None if neither a model nor inertias are known.
+        covariance: (b, b) of the values; None if unknown.
+        friction: whether the values include friction.
+        notes: remarks for the user.
     """
 
     smooth: LoadCases
@@ -64,14 +65,16 @@ def read_model(
     """Return the model to excite: from an identification's folder, or from the robot's inertias and the given friction.
 
     Args:
-        folder: of an identification; its torque rows count, and its payloads that `loads` names.
-        sets: drive terms of motor torques, where there are neither folder nor options.
-        options: of the identification that will follow, where there is no folder.
+        chain: the arm.
+        folder: folder of an identification; its torque rows are used, with those of its payloads that `loads` names.
+        sets: drive terms of motor torques, used without folder and options.
+        limits: limits of the motion, with the friction that the limits file states.
+        options: options of the identification that will follow; only without a folder.
         loads: see `ExcitationSettings`.
         nominal: see `excited_model`.
 
     Raises:
-        UsageError: for an unknown payload.
+        UsageError: for an unknown payload, or if both folder and options are given.
     """
     if folder is not None:
         if options is not None:
@@ -124,7 +127,7 @@ def read_model(
 
 
 def check_held(model: ExcitedModel, limits: MotionLimits) -> None:
-    """Raise an error where gravity is beyond the torque limits in most postures: payload too heavy, or wrong masses."""
+    """Raise a UsageError if gravity exceeds the torque limits in most postures: payload too heavy, or wrong masses."""
     if model.values is None:
         return
     exact, box = model.exact, limits.positions
@@ -167,7 +170,9 @@ def stated_payloads(options: IdentificationSettings | None) -> tuple[list[tuple[
 
 
 def loads_of(texts: Sequence[str], payloads: Sequence[str], with_payloads: bool) -> Loads:
-    """Return the payload labels of each run; by default none, then each payload alone if `with_payloads`."""
+    """Return the payload labels of each run; by default a run without payload, then, if `with_payloads`, one per
+    payload.
+    """
     if not texts:
         if with_payloads and payloads:
             return ((), *((label,) for label in payloads))
@@ -241,7 +246,7 @@ def moved_to(chain: Chain, model: IdentificationModel) -> IdentificationModel:
 
 
 def _payloads(model: IdentificationModel) -> list[str]:
-    """Return the labels of the payloads of a model, whose bodies move with no joint's coordinate."""
+    """Return the labels of a model's payloads: the bodies that are not assigned to a joint coordinate."""
     bodies = zip(model.bodies.labels, model.bodies.coordinates)
     return [label for label, coordinate in bodies if coordinate < 0]
 
@@ -257,10 +262,12 @@ def excited_model(
     """Return the base model to excite, with a smoothed Coulomb sign for the search, from an identification model.
 
     Args:
+        model: the identification model.
         loads: payload labels of each run.
-        values: (p,) of the model's parameters; None: unknown.
-        friction: whether friction is among the values.
-        nominal: the arm that base columns are chosen on, as by the identification; None: the model's own.
+        values: (p,) values of the model's parameters; None: unknown.
+        friction: whether the values include friction.
+        notes: remarks for the user.
+        nominal: arm on which the base columns are selected, as by the identification; None: the model's arm.
     """
     smooth_terms = []
     for term in model.terms:
@@ -291,7 +298,7 @@ def excited_model(
 
 
 def covariance_of(path: Path, model: LoadCases) -> np.ndarray | None:
-    """Return the covariance of a model's columns; None if the file has other columns."""
+    """Return the covariance (b, b) of a model's base columns; None if the file is missing or has other columns."""
     names: Sequence[str] = ()
     covariance = np.empty((0, 0))
     if path.is_file():

@@ -47,20 +47,24 @@ DEFAULT_DEGREE = 5
 
 
 def check_design_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Raise an error if a folder contains other results or input files, so that no designed motion can be written."""
+    """Raise a UsageError if a folder contains other results or input files, so that no designed motion can be
+    written.
+    """
     check_target(out, ALL, DESIGN, "excitation", inputs)
 
 
 def check_plan_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Raise an error if a folder contains other results or input files, so that no planned motion can be written."""
+    """Raise a UsageError if a folder contains other results or input files, so that no planned motion can be
+    written.
+    """
     check_target(out, ALL, PLAN, "plan", inputs)
 
 
 def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path], None] | None = None) -> Path:
-    """Write the folder of a designed motion; `draw` adds figures.
+    """Write the folder of a designed motion and return its path; `draw` adds figures.
 
     Raises:
-        UsageError: where the disk refuses; what stood there stays.
+        UsageError: if a file cannot be written; the earlier content of the folder is kept.
     """
 
     def write(folder: Path) -> None:
@@ -97,7 +101,7 @@ def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path],
 
 
 def _write_front(front: Front, folder: Path) -> None:
-    """Write the trade-offs, one row per motion."""
+    """Write the trade-offs between goals as a table, one row per motion."""
     rows = []
     for k, values in enumerate(front.values):
         rows.append([*map(float, values), bool(front.best[k]), k == front.designed])
@@ -105,10 +109,10 @@ def _write_front(front: Front, folder: Path) -> None:
 
 
 def write_plan(planned: Planned, out: Path, draw: Callable[[Planned, Path], None] | None = None) -> Path:
-    """Write the folder of a planned motion; `draw` adds figures.
+    """Write the folder of a planned motion and return its path; `draw` adds figures.
 
     Raises:
-        UsageError: where the disk refuses; what stood there stays.
+        UsageError: if a file cannot be written; the earlier content of the folder is kept.
     """
 
     def write(folder: Path) -> None:
@@ -124,7 +128,7 @@ def write_plan(planned: Planned, out: Path, draw: Callable[[Planned, Path], None
 
 
 def _write_arm(chain: Chain, source: str, folder: Path) -> None:
-    """Write the robot that a motion was made for, and which description it came from."""
+    """Write the robot that a motion was made for, with the name of its description."""
     description.write(folder / coefficients.ARM, chain, {"provenance": {"robot": source}})
 
 
@@ -150,7 +154,9 @@ def _write_approach_and_rehearsal(motion: Playback | Planned, bounds: MotionBoun
 
 
 def _write_messages(track: Setpoints, bounds: MotionBounds, folder: Path, step: int = 1) -> None:
-    """Write ``trajectory.json`` and ``trajectory.yaml`` (trajectory_msgs/JointTrajectory), every `every`-th sample."""
+    """Write ``trajectory.json`` and ``trajectory.yaml`` (trajectory_msgs/JointTrajectory) with every `step`-th
+    sample.
+    """
     bounds.check(track)
     message = joint_trajectory(track, [joint.name for joint in bounds.joints], step)
     # JSON has no remarks
@@ -159,7 +165,9 @@ def _write_messages(track: Setpoints, bounds: MotionBounds, folder: Path, step: 
 
 
 def one_period(designed: Designed, rate: float | None = None) -> Setpoints:
-    """Return the setpoints of one period at `rate` [Hz] (default: the controller's), both ends included, no torques."""
+    """Return the setpoints of one period at `rate` [Hz] (None: the controller's), both ends included, without
+    torques.
+    """
     count = max(round(designed.period * (rate or designed.settings.rate)), 1)
     times = np.arange(count + 1) * (designed.period / count)
     motion = dense_motion(designed.family, designed.found.x, times, designed.found.factor)
@@ -336,7 +344,7 @@ def plan_lines(planned: Planned) -> list[str]:
 
 @dataclass(frozen=True)
 class _PlanMargin:
-    """Margin to a limit: of the joint closest to the limit, and of each joint as a share of the limit."""
+    """Smallest margin to a limit: of the joint closest to it (also as a share of its limit), and of all joints."""
 
     margin: float
     unit: str
@@ -366,7 +374,7 @@ def _margins(planned: Planned) -> dict[str, _PlanMargin]:
 
 
 def _margin(planned: Planned, name: str, margins: np.ndarray, share: float, unit_size: float) -> _PlanMargin:
-    """Return the smallest of the margins (n,) of joints to a limit; `unit_size`: what a margin of 1 is."""
+    """Return the smallest of the margins (n,) of joints to a limit; `unit_size` converts it to the limit's unit."""
     j = int(np.argmin(margins))
     joint = planned.chain.joints[j]
     unit = motion_units([joint.kind])[KINDS.index(name)]

@@ -1,4 +1,4 @@
-"""What the uncertainty of a calibrated geometry does to the torques that a motion is designed for."""
+"""Effect of the uncertainty of a calibrated geometry on the torques predicted for a designed motion."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,18 +17,18 @@ from calib.robot.chain import Chain
 
 @dataclass(frozen=True, eq=False)
 class GeometrySpread:
-    """Errors of a geometry, see `calib.procedure.excitation.prior_motions.PrincipalErrors`.
+    """Principal errors of a geometry, see `calib.procedure.excitation.prior_motions.PrincipalErrors`.
 
     Attributes:
-        moved: r pairs of models, on the geometry with +g_i and with -g_i.
-        before: (b, r) S g_i.
+        moved: r pairs of models, on the geometry changed by +g_i and by -g_i.
+        before: (b, r) shifts S g_i of the base parameters of an earlier identification; zero without one.
     """
 
     moved: tuple[tuple[LoadCases, LoadCases], ...]
     before: np.ndarray
 
     def felt(self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the torques' changes (N, rows, r) at fixed base parameters `values` (b,)."""
+        """Return the changes of the torques (N, rows, r) by each principal error, at base parameters `values` (b,)."""
         changes = []
         for up, down in self.moved:
             change = up.regressor(q, v, a) - down.regressor(q, v, a)
@@ -39,12 +39,14 @@ class GeometrySpread:
 def geometry_spread(
     robot: object, source: Path, chain: Chain, model: ExcitedModel, after: Path | None
 ) -> GeometrySpread | None:
-    """Return the principal errors of a geometry, and what they did to the parameters of an identification.
+    """Return the principal errors of a geometry, and their effect on the parameters of an identification; None if
+    unknown.
 
     Args:
-        robot, source: as given, and its file; chain: as designed for.
-        model: that predicts the torques.
-        after: folder of the identification; its geometry's covariance counts.
+        robot, source: robot as given by the caller, and its file.
+        chain: arm that the motion is designed for.
+        model: model that predicts the torques.
+        after: folder of the identification whose geometry's covariance is used; None: that of the robot.
     """
     stored = None if after is None else after / SENSITIVITY
     path = source if after is None else after / calibrated.ROBOT

@@ -36,15 +36,15 @@ TOLERANCE = 0.01
 def objectives_of(
     settings: ExcitationSettings, condition: Excitation, inputs: ExcitationInputs
 ) -> tuple[tuple[Objective, float], ...]:
-    """Return the objectives and their weights: as set, or both condition numbers with equal weights.
+    """Return the objectives and their weights: an aim, or both condition numbers with equal weights.
 
     Args:
-        settings: of the design.
-        condition: see `read_goals`.
-        inputs: robot and model; without goals the determinant is the aim where an identification states torque errors.
+        settings: settings of the design.
+        condition: template of a condition number's objective, see `read_goals`.
+        inputs: robot and model; without goals, the determinant is the aim if an identification states torque errors.
 
     Raises:
-        UsageError: for two aims, or one together with the condition numbers that it replaces.
+        UsageError: for two aims, or an aim together with the condition numbers that it replaces.
     """
     aims = [aim for aim in AIMS if aim in settings.goals]
     default_aim = inputs.errors_known and not settings.goals
@@ -98,12 +98,12 @@ def read_goals(settings: ExcitationSettings, inputs: ExcitationInputs, condition
     """Return the goals stated in the settings: first the soft goals, then the hard goals.
 
     Args:
-        settings: of the design.
+        settings: settings of the design.
         inputs: robot and model.
-        condition: what a condition number is of: columns, rows, earlier information.
+        condition: template of a condition number's objective: columns, rows, earlier information.
 
     Raises:
-        UsageError: for an unknown goal, or one that the inputs do not suffice to compute.
+        UsageError: for an unknown goal, or a goal that the inputs do not suffice to compute.
     """
     soft = [text for text in settings.goals if text not in AIMS]
     goals = _goals(soft, None, inputs, condition, settings.shortest)
@@ -113,7 +113,7 @@ def read_goals(settings: ExcitationSettings, inputs: ExcitationInputs, condition
 def _goals(
     texts: Sequence[str], weight: float | None, inputs: ExcitationInputs, condition: Excitation, shortest: float | None
 ) -> list[AttainmentGoal]:
-    """Return the goals that texts state; a hard goal has the weight 0."""
+    """Return the goals that texts (``name=value``) state; `weight` 0 for hard goals, None for soft ones."""
     names = [split_goal(text)[0] for text in texts if text not in AIMS]
     goals = []
     for text in texts:

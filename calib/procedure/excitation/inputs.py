@@ -30,10 +30,12 @@ class IdentifiableColumns:
     """The columns that a motion can identify.
 
     Attributes:
-        columns: (c,) of the model's; None: all of them.
-        sigmas: (rows,) by which torque rows are divided, see `PriorMotions`; infinite for rows left out; None: 1.
-        names: of the columns; notes: what a user should know.
-        chosen: (k,) of the model's, for which the motion is designed while the others are estimated, too; None: all.
+        columns: (c,) indices of the identifiable columns among the model's base columns; None: all of them.
+        sigmas: (rows,) σ by which torque rows are divided, see `PriorMotions`; infinite for excluded rows; None: 1.
+        names: names of the identifiable columns.
+        notes: remarks for the user.
+        chosen: (k,) indices of the columns for which the motion is designed while the others are estimated, too; None:
+            all.
     """
 
     columns: np.ndarray | None
@@ -44,14 +46,14 @@ class IdentifiableColumns:
 
     @property
     def aimed(self) -> np.ndarray | None:
-        """The model's columns whose condition number counts; None: all."""
+        """The model's columns (indices) whose condition number is minimised; None: all."""
         if self.chosen is None:
             return self.columns
         return self.chosen
 
     @property
     def aimed_names(self) -> tuple[str, ...]:
-        """Names of the columns whose condition number counts."""
+        """Names of the columns whose condition number is minimised."""
         if self.chosen is None:
             return self.names
         columns = range(len(self.names)) if self.columns is None else self.columns
@@ -70,11 +72,12 @@ class ExcitationInputs:
     """Inputs of a design: robot, limits, model, locked joints, and earlier motions.
 
     Attributes:
-        chain, limits, model: the arm, what it must keep, and the dynamics to excite.
-        locked: joint index -> its fixed value; None: the search chooses it.
-        columns: that the motion can identify.
-        prior: motions that count already; None without any.
-        geometry: its uncertainty, of a calibrated robot whose torques can be predicted; None elsewhere.
+        chain, limits, model: the arm, the limits of its motion, and the dynamics to excite.
+        locked: joint index -> its fixed value [rad or m]; None: the search chooses the value.
+        columns: columns that the motion can identify.
+        prior: information of earlier motions; None without any.
+        geometry: uncertainty of a calibrated robot's geometry; None if the robot is not calibrated or torques are
+            unknown.
         source: the robot's description, as named by the user; empty if unknown.
     """
 
@@ -89,7 +92,7 @@ class ExcitationInputs:
 
     @property
     def errors_known(self) -> bool:
-        """Whether an identification states the errors of the torques."""
+        """Whether an earlier identification states the standard deviations of the torque errors."""
         return self.prior is not None and self.prior.sigmas is not None
 
 
@@ -103,14 +106,16 @@ def read_inputs(
     options: IdentificationSettings | None = None,
     after: Path | None = None,
 ) -> ExcitationInputs:
-    """Read robot, limits, model and earlier motions of an excitation.
+    """Return the inputs of an excitation: robot, limits, model and earlier motions, read from their files.
 
     Args:
         robot, base, tip: see `calib.robot.library`.
+        settings: settings of the design.
         model: folder of an identification: torques, friction and their uncertainty.
         limits: see `calib.procedure.excitation.limits`.
-        options: of the identification that will follow: torque rows, drive terms, payloads.
-        after: folder of an identification that the motion shall add to: its model, information and torque errors.
+        options: options of the identification that will follow: torque rows, drive terms, payloads.
+        after: folder of an identification whose recordings the motion shall complement; it replaces `model`, and its
+            information and torque errors are used.
 
     Raises:
         UsageError, MeasurementError: for a file that cannot be read, or belongs to another robot.
@@ -193,7 +198,11 @@ def identifiable(
     """Return the columns that a motion with locked joints, together with earlier motions, can identify.
 
     Args:
-        noise: (rows,) by which torque rows are divided, where no earlier motion states it; None: 1.
+        model: the model to excite.
+        chain: the arm.
+        locked: joint index -> its fixed value; None: chosen by the search.
+        prior: information of earlier motions; None without any.
+        noise: (rows,) σ of the torque rows where no earlier motion states it; None: 1.
     """
     names = model.exact.names
     information = None

@@ -87,14 +87,15 @@ class MotionBounds:
     """Limits (n,) of a motion's speed, acceleration and torque magnitudes; infinite: not limited.
 
     Attributes:
-        robot: its file or name, for messages; joints: n of them.
-        velocity, acceleration: [rad/s or m/s, and per s].
-        torque: [N m or N], where a model predicts torques; else infinite.
-        origin: where they are stated, by ``velocity``, ``acceleration`` and ``torque``.
-        place: where a user can state what is missing, {} for an example.
+        robot: the robot's file or name, for messages.
+        joints: the n joints.
+        velocity, acceleration: [rad/s or m/s], [rad/s² or m/s²].
+        torque: [N m or N] if a model predicts torques; else infinite.
+        origin: ``velocity``, ``acceleration`` or ``torque`` -> name of the file that states the limits.
+        place: text that says where a user can state missing limits, with {} for an example.
 
     Raises:
-        UsageError: naming the joints that nothing limits, and what to state.
+        UsageError: if joints have no limit; the message names the joints, and what to state.
     """
 
     robot: str
@@ -115,7 +116,9 @@ class MotionBounds:
         )
 
     def _require(self, example: str, limits: Mapping[str, np.ndarray], quantity: str, hint: str) -> None:
-        """Raise an error if a joint has none of the limits: naming the joints, and what to state."""
+        """Raise a UsageError if a joint has none of the given limits; the message names the joints, and what to
+        state.
+        """
         unlimited = np.all([sizes > MAX[kind] for kind, sizes in limits.items()], axis=0)
         if not unlimited.any():
             return
@@ -134,7 +137,7 @@ class MotionBounds:
         )
 
     def _named(self, joints: Sequence[Joint]) -> str:
-        """Return the joints' names."""
+        """Return the joints' names as text; ``all joints`` if there are no others."""
         if len(joints) == len(self.joints):
             return "all joints"
         return ", ".join(joint.name for joint in joints)
@@ -158,18 +161,19 @@ class MotionBounds:
         return lines
 
     def check(self, track: Setpoints) -> None:
-        """Raise an error if a track exceeds its limits of speed or acceleration, or those of any real joint.
+        """Raise an error if a track exceeds its limits of speed or acceleration, or `MAX`, beyond which no real joint
+        moves.
 
-        Light links and high torque limits allow accelerations that no robot has.
+        `MAX` matters where light links and high torque limits would allow accelerations that no robot reaches.
 
         Raises:
-            UsageError: naming the joint.
+            UsageError: naming the joint and the limit.
         """
         self._check("velocity", np.abs(track.v).max(axis=0), self.velocity)
         self._check("acceleration", np.abs(track.a).max(axis=0), self.acceleration)
 
     def _check(self, kind: str, peak: np.ndarray, limit: np.ndarray) -> None:
-        """Raise an error if a joint's largest speed or acceleration (n,) exceeds its limit."""
+        """Raise a UsageError if a joint's largest speed or acceleration (n,) exceeds its limit (n,)."""
         limit = np.minimum(limit, MAX[kind])
         j = int(np.argmax(peak / limit))
         if not peak[j] <= (1.0 + MAX_EXCESS) * limit[j]:
@@ -226,14 +230,15 @@ class MotionLimits:
     """Limits of a motion: constraints, bounds and torque limits of each joint, and friction if stated.
 
     Attributes:
-        constraints: all but torque.
-        bounds: of speed, acceleration and torque, each joint's.
+        constraints: all constraints except those on torques.
+        bounds: limits of each joint's speed, acceleration and torque.
         torque: (n,) limits [N m or N], also without a model that predicts torques; infinite: not limited.
-        margin, deviations: of the torque limit; `margin` None where the file does not say.
-        friction: (2, n) Fv and Fc; None where the file does not say.
-        resonance: [rad/s] or None.
-        notes: what a user should know.
-        noise: (n,) standard deviation of the torques' errors [N m or N]; None where the file does not say.
+        margin: share of the torque limits that stays free; None if the file does not state it.
+        deviations: number of standard deviations of the predicted torque that stay free.
+        friction: (2, n) viscous Fv and Coulomb Fc; None if the file does not state them.
+        resonance: smallest resonance [rad/s]; None if the file does not state it.
+        notes: remarks for the user.
+        noise: (n,) standard deviation of the torques' errors [N m or N]; None if the file does not state it.
     """
 
     constraints: tuple[MotionConstraint, ...]
@@ -248,7 +253,7 @@ class MotionLimits:
 
     @property
     def positions(self) -> BoxLimit:
-        """The joint position limits; infinite: not limited."""
+        """Limits of the joint positions; infinite: not limited."""
         for constraint in self.constraints:
             if isinstance(constraint, BoxLimit) and constraint.order == 0:
                 return constraint
@@ -256,7 +261,9 @@ class MotionLimits:
         return BoxLimit(0, -unlimited, unlimited)
 
     def narrowed(self, ranges: Sequence[tuple[np.ndarray, np.ndarray]]) -> "MotionLimits":
-        """Return the limits with those of a motion: least and largest q, v and a (n,), of joints that move."""
+        """Return the limits, narrowed to the range of a motion: least and largest q, v and a (n,) of its moving
+        joints.
+        """
         boxes = []
         for order, (low, high) in enumerate(ranges):
             lower, upper = np.where(low < high, [low, high], [[-np.inf], [np.inf]])
@@ -264,7 +271,9 @@ class MotionLimits:
         return replace(self, constraints=(*self.constraints, *boxes))
 
     def broken(self, motion: SampledMotion) -> Iterator[tuple[MotionConstraint, str, int]]:
-        """Yield (constraint, message, index of the worst of N states) for each violated constraint on positions."""
+        """Yield (constraint, message, index of the worst of N states) for each violated constraint except joint
+        limits.
+        """
         for limit in self.constraints:
             if isinstance(limit, BoxLimit):
                 continue
@@ -282,17 +291,18 @@ def read_motion_limits(
     """Return the limits of a motion from the limits file and the robot; defaults are those of pose selection.
 
     Args:
-        tables: the file, or its tables; None for the robot's own limits and the defaults alone.
+        tables: the limits file, or its tables; None: the robot's own limits and the defaults only.
         chain: the arm.
         source: the robot's file, for its collision shapes.
-        stated_path: the motion goes where its user says: what is not stated is not kept, since capsules and a floor
-            that we think of should not forbid a path that somebody knows.
-        predicted: torques are, by an identified model, so that their limits count; so they do where the chain's masses
-            are known.
+        stated_path: whether the user states the path; then only stated limits are used, since default capsules and a
+            default floor should not forbid a path that the user knows to be free.
+        predicted: whether an identified model predicts torques, so that torque limits apply; they also apply if the
+            chain's masses are known.
 
     Raises:
-        UsageError: for an unknown key or a value that a key cannot have, and where nothing limits speeds, or
-            accelerations and torques (`MotionBounds`).
+        UsageError: for an unknown key or a value that a key cannot have, and if a joint has no limit of speed, or
+            limits
+            of neither acceleration nor torque (`MotionBounds`).
     """
     settings, where = read(LimitsFile, *tables_of(tables, chain, source, "limits"))
     without = ()
@@ -371,7 +381,7 @@ def check_bodies(chain: Chain, torque: np.ndarray) -> None:
     """Raise an error if torques are limited but the robot's masses or inertias are physically inconsistent.
 
     Raises:
-        UsageError: naming them.
+        UsageError: naming the inconsistent bodies.
     """
     if not np.isfinite(torque).any():
         return
@@ -386,10 +396,15 @@ def check_bodies(chain: Chain, torque: np.ndarray) -> None:
 def _bounds(
     chain: Chain, robot: str, settings: LimitsFile, path: str, sizes: Sequence[np.ndarray], default: bool
 ) -> MotionBounds:
-    """Return the bounds of speed, acceleration and torque; an acceleration without limit gets a default limit.
+    """Return the bounds of speed, acceleration and torque; with `default`, unlimited accelerations get a default limit.
 
     Args:
-        sizes: (n,) largest velocities, accelerations, torques.
+        chain: the arm.
+        robot: the robot's name for messages.
+        settings: content of the limits file.
+        path: name of the limits file for messages.
+        sizes: largest velocities, accelerations and torques, each (n,).
+        default: whether joints without a limit of acceleration and torque get a default limit of acceleration.
     """
     velocity, acceleration, torque = sizes
     origin = {"acceleration": path}
@@ -406,7 +421,7 @@ def _bounds(
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Named points of links: q (N, n) -> (N, k, 3) [m] in the base frame."""
+    """Named points of links: callable, joint values q (N, n) -> positions (N, k, 3) [m] in the base frame."""
 
     chain: Chain
     joints: tuple[int, ...]
@@ -416,7 +431,7 @@ class Points:
         return self._positions(q, sweep(self.chain, q).poses())
 
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-        """Return the gradient (N, n) of Σ G · points with respect to q."""
+        """Return the gradient (N, n) of Σ G · points with respect to q, for weights G (N, k, 3)."""
         kinematics = sweep(self.chain, q)
         points = self._positions(q, kinematics.poses())
         gradient = np.zeros(q.shape)
@@ -490,7 +505,11 @@ def _per_joint(
     """Return limits (n,) from a table with the keys joint name, q1 …, ``all``, ``share``; infinite if not stated.
 
     Args:
-        quantities: of a revolute joint's limit, and of a prismatic one's.
+        values: the table.
+        where: its name for messages.
+        chain: the arm.
+        default: (n,) limits of joints that the table does not name; None: infinite.
+        quantities: name of the quantity for a revolute joint, and for a prismatic one.
     """
     index = {f"q{j + 1}": j for j in range(chain.n)}
     index |= {name: j for j, name in enumerate(chain.joint_names)}

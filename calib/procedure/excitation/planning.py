@@ -73,9 +73,10 @@ def read_waypoints(
 
     Args:
         waypoints: the file; or in memory joint values (m, n) [rad or m], poses (m, 4, 4) [m], or targets.
-        chain: whose tip stands at the places, the best geometry there is.
+        chain: arm with the best known geometry, whose tip is to reach the waypoints.
         lower, upper: (n,) joint limits to stay within.
-        start: (n,) where the robot stands: the first place is reached near it; else near the middle of the limits.
+        start: (n,) joint values of the robot before the motion: the first waypoint is solved near them; None: near the
+            middle of the limits.
 
     Raises:
         UsageError: for a waypoint out of reach, with its number and the distance.
@@ -113,7 +114,9 @@ def read_waypoints(
 def _reached(
     goal: Goal, target: np.ndarray, start_q: np.ndarray, configurations: np.ndarray, targets: Targets, k: int
 ) -> np.ndarray:
-    """Return joint values (n,) at a target (1, 4, 4), solved from the present pose or else by many tries."""
+    """Return joint values (n,) that reach a target (1, 4, 4), solved from `start_q`, or else from many
+    configurations.
+    """
     present = start_q[None]
     q = inverse.nearest(goal, target, present, inverse.reach(goal, target, present))
     if np.abs(inverse.differences(goal, q, target)).max() <= MAX_ERROR:
@@ -154,17 +157,18 @@ class Planned:
 
     Attributes:
         chain: the robot.
-        bounds: what limits its speed and acceleration, and where that is stated.
-        limits, lower, upper: what the motion keeps, margins of torque taken off.
-        timings: one per path: a single one through all waypoints, or one per tool line.
+        bounds: limits of speed and acceleration, and where they are stated.
+        limits: limits that the motion keeps, with the torque margins subtracted.
+        lower, upper: (n,) joint limits.
+        timings: one per path: a single path through all waypoints, or one per straight line of the tool.
         track: the motion at the controller's rate.
-        margins: (n,) to the joint limits [rad or m]; None if the path is not a joint path.
-        deviation: (2,) of the tool from its lines [m, rad]; None for joint paths.
-        shaped: what the outer loop found; None without one.
-        approach, rehearsal: tracks; None where not asked for.
+        margins: (n,) distance to the joint limits [rad or m]; None for straight lines of the tool.
+        deviation: (2,) largest deviation of the tool from its lines [m, rad]; None for joint paths.
+        shaped: result of the optimisation of the path's shape; None without one.
+        approach, rehearsal: tracks; None if not requested.
         sigma: (n,) largest standard deviation of each predicted torque; `limits.torque` leaves as many of them free as
-            the limits file says (default 2); None where the model states none.
-        notes: what a user should know.
+            the limits file says (default 2); None if the model states none.
+        notes: remarks for the user.
         source: the robot's description, as named by the user; empty if unknown.
     """
 
@@ -208,15 +212,16 @@ def plan(
     tip: str | None = None,
     progress: Progress | None = None,
 ) -> Planned:
-    """Plan the fastest motion of a robot through the waypoints of a file.
+    """Return the fastest motion of a robot through waypoints, within its limits.
 
     Args:
         robot, base, tip: see `calib.robot.library`.
         waypoints: see `calib.procedure.excitation.planning`.
         settings: see `calib.procedure.excitation.settings`.
-        model: folder of an identification; its geometry is planned with, the limits are the robot's.
-        limits: see `calib.procedure.excitation.limits`; drives: see `_read_drives`.
-        progress: called with words.
+        model: folder of an identification; its geometry and torques are used, the limits are those of the robot.
+        limits: see `calib.procedure.excitation.limits`.
+        drives: drive parameters, see `_read_drives`.
+        progress: called with the name of each step; None: silent.
 
     Raises:
         UsageError: for waypoints that cannot be reached, and limits that cannot be kept.
@@ -301,7 +306,7 @@ def _shortened(
     dynamics: PathDynamics | None,
     show: Progress,
 ) -> Shaped:
-    """Return the path through the waypoints whose shape gives the shortest time within all limits."""
+    """Return the path through the waypoints (m, n) whose shape gives the shortest time within all limits."""
     positions = motion_limits.positions
 
     def duration(path: JointPath) -> float:
@@ -340,7 +345,11 @@ def _check_constraints(path: JointPath, limits: MotionLimits) -> None:
 def _dynamics(
     chain: Chain, folder: Path | None, payloads: Sequence[str], tables: Tables | None, limits: MotionLimits
 ) -> tuple[PathDynamics | None, tuple[str, ...], Uncertainty | None]:
-    """Return the dynamics: identified model, or the robot's inertias and stated drives; None without both."""
+    """Return dynamics, notes and uncertainty: of the identified model, or of the robot's inertias and stated drives.
+
+    Dynamics are None if the robot has neither inertias nor drives; uncertainty is None without an identified
+    covariance.
+    """
     if folder is not None:
         require(tables is None, "model and drives both state drive parameters; leave one of them out", UsageError)
         dynamics, uncertainty = _identified(chain, folder, payloads)
@@ -372,7 +381,7 @@ def _dynamics(
 
 
 def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[PathDynamics, Uncertainty | None]:
-    """Return the dynamics of an identified model with the payloads, and its uncertainty or None."""
+    """Return the dynamics of an identified model with the payloads, and its uncertainty; None without a covariance."""
     refuse_currents(folder, "a motion plan")
     refuse_other_arm(folder, chain)
     _, dynamics = read_dynamics(folder)
@@ -396,7 +405,7 @@ def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[Pa
 
 
 def _guarded(limits: TimingLimits, margin: np.ndarray, chain: Chain) -> TimingLimits:
-    """Return the limits with each torque limit reduced by a margin (n,)."""
+    """Return the limits with each torque limit reduced by a margin (n,) [N m or N]; refuse a margin above the limit."""
     if (margin >= limits.torque).any():
         j = int(np.argmax(margin / limits.torque))
         raise UsageError(
@@ -407,7 +416,10 @@ def _guarded(limits: TimingLimits, margin: np.ndarray, chain: Chain) -> TimingLi
 
 
 def _paths(chain: Chain, points: np.ndarray, straight: bool) -> tuple[list[JointPath], np.ndarray | None]:
-    """Return the paths through waypoints (m, n): one spline, or lines of the tool with their deviation (2,)."""
+    """Return the paths through waypoints (m, n): one spline, or straight lines of the tool.
+
+    The second value is the lines' largest deviation (2,) [m, rad]; None for the spline.
+    """
     if not straight:
         return [spline(points)], None
     start = checked(points)[0]

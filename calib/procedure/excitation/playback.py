@@ -1,6 +1,7 @@
 """Setpoints of an exciting motion for a controller: approach, periods, and a slow rehearsal.
 
-The approach leads from where a robot stands to where a motion starts: calm, jerk-limited, within the limits file.
+The approach leads from the robot's present posture to the start of the motion, slowly, with limited jerk, and within
+the limits file.
 """
 
 from collections.abc import Sequence
@@ -39,10 +40,10 @@ class Playback:
     """Setpoints for a controller: run, approach and rehearsal.
 
     Attributes:
-        run: the approach, where there is one, and `repeat` periods.
-        approach, rehearsal: None where not asked for; the rehearsal is the approach and one period, slower.
-        repeat: periods.
-        notes: what a user should know.
+        run: `repeat` periods, preceded by the approach if there is one.
+        approach, rehearsal: None if not requested; the rehearsal is the approach and one period at lower speed.
+        repeat: number of periods.
+        notes: remarks for the user.
     """
 
     run: Setpoints
@@ -75,7 +76,7 @@ def play(family: Family, result: SearchResult, inputs: ExcitationInputs, setting
 
 
 def _with_torque(track: Setpoints, dynamics: ExcitedModel) -> Setpoints:
-    """Return the track with predicted torques, largest over the loads; unchanged if parameters are unknown."""
+    """Return the track with the largest predicted torques over all loads; unchanged if parameters are unknown."""
     if dynamics.values is None:
         return track
     torques = []
@@ -87,7 +88,7 @@ def _with_torque(track: Setpoints, dynamics: ExcitedModel) -> Setpoints:
 
 
 def _torques(name: str, track: Setpoints | None, limits: MotionLimits, chain: Chain) -> tuple[str, ...]:
-    """Return a note if the torques of a track exceed their limits."""
+    """Return a note if the predicted torques of a track exceed their limits; () if not."""
     if track is None or track.tau is None:
         return ()
     share = (np.abs(track.tau) / limits.torque).max(axis=0)
@@ -102,13 +103,13 @@ def approach_to(
 ) -> tuple[Setpoints | None, tuple[str, ...]]:
     """Return setpoints of a straight approach in joint space to the start of a motion, and notes on violated limits.
 
-    Velocity, acceleration and jerk come from the limits file, else from the robot and our own choice.
+    Limits of velocity, acceleration and jerk come from the limits file, else from the robot, else from our own choice.
 
     Args:
-        start: (n,) where the robot stands [rad or m]; None: no approach.
-        goal: (n,) where the motion starts.
-        rate: of the controller [Hz].
-        limits: of the motion.
+        start: (n,) joint values of the robot before the motion [rad or m]; None: no approach.
+        goal: (n,) joint values at the start of the motion [rad or m].
+        rate: rate of the controller [Hz].
+        limits: limits of the motion.
         chain: the arm.
 
     Raises:
@@ -141,7 +142,7 @@ def approach_to(
 
 
 def check_start(start: Sequence[float] | None, chain: Chain, limits: MotionLimits) -> np.ndarray | None:
-    """Return the start as an array (n,); raise an error for a wrong number of values or a violated joint limit."""
+    """Return the start as an array (n,), None if None; refuse a wrong number of values or a violated joint limit."""
     if start is None:
         return None
     q = np.asarray(start, dtype=float)

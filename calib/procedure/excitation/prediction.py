@@ -1,18 +1,18 @@
 """Predicted σ of the parameters and torques that a motion identifies, before the robot moves.
 
-With Y one sample's regressor and σ_j the error of joint j's torque that no parameter explains, a log of R independent
-rows per joint leaves the base parameters with the covariance
+With Y the regressor of one sample and σ_j the standard deviation of joint j's torque error that no parameter explains,
+a log of R independent rows per joint yields the base parameters with the covariance
 
     C = (R · mean over the period of Σ_j Y_jᵀ Y_j / σ_j²)⁻¹,
 
-and a torque on other motion with the variance Y C Yᵀ. On a calibrated robot an error g of the geometry, the same in all
-logs, adds to both (`calib.identification.uncertainty.geometry_uncertainty`): the parameters err by S g = -C Σ Yᵀ
-(∂Y/∂g φ) g / σ²,
-with earlier motions C (C_before⁻¹ S_before g - …), and torques by Y S g + (∂Y/∂g φ) g. A design minimises the part of
-the torques' errors alone. R counts the rows that `calib identify` keeps: twice the band
-that its own rules read from the accelerations. What is not known before a log is σ_j: noise, and friction that no term
-holds. It is taken as the limits file states it ([noise]), or as a share of the torque limits, stated or
-`DEFAULT_NOISE`; all sigmas but the geometry's part go with it in proportion.
+and the torque of another motion with the variance Y C Yᵀ. On a calibrated robot an error g of the geometry, which is
+the same in all logs, adds to both (`calib.identification.uncertainty.geometry_uncertainty`): the parameters err by
+S g = -C Σ Yᵀ (∂Y/∂g φ) g / σ², with earlier motions by C (C_before⁻¹ S_before g - …), and the torques by
+Y S g + (∂Y/∂g φ) g. A design minimises only the part from torque errors. R is the number of rows that
+`calib identify` keeps: twice the identification band, computed from the accelerations by the same rules. Before a log
+exists, σ_j is unknown: it consists of noise, and of friction that no term models. It is taken from the limits file
+([noise]), or as a share of the torque limits, stated or `DEFAULT_NOISE`; all predicted σ except the geometry's part are
+proportional to it.
 """
 
 from collections.abc import Callable, Sequence
@@ -58,10 +58,10 @@ class MotionPrediction:
     """σ predicted for a log of a motion.
 
     Attributes:
-        seconds: of motion.
-        rows_per_joint: independent ones.
-        torque_sigma: (n,) rms of the predicted torque's sigma over the typical task [N m or N].
-        torque_sigma_share: the same, rms over the joints, as a share of the torque limits.
+        seconds: duration of the motion.
+        rows_per_joint: number of independent rows per joint.
+        torque_sigma: (n,) rms of the predicted torque's σ over the typical task [N m or N].
+        torque_sigma_share: rms of `torque_sigma` over the joints, as a share of the torque limits.
     """
 
     seconds: float
@@ -71,9 +71,10 @@ class MotionPrediction:
 
 
 class PredictedSigma(NamedTuple):
-    """A row of ``prediction.csv``: a parameter, its value if known, and the sigma predicted for the motion as run.
+    """A row of ``prediction.csv``: a parameter, its value if known, and the σ predicted for the motion as run.
 
-    `sigma_before` is that of an identification that the motion adds to; `sigma_geometry` the geometry's part of sigma.
+    `sigma_before` is the σ of the identification that the motion complements; `sigma_geometry` the geometry's part of
+    σ.
     """
 
     name: str
@@ -86,7 +87,9 @@ class PredictedSigma(NamedTuple):
 
 
 class Task(NamedTuple):
-    """Regressors (N, rows, c) at states of a typical task, and the torques' changes (N, rows, r) by the geometry."""
+    """Regressors (N, rows, c) at states of a typical task, and the torques' changes (N, rows, r) by the geometry's
+    errors.
+    """
 
     regressors: np.ndarray
     felt: np.ndarray
@@ -97,11 +100,12 @@ class MotionOutlook:
     """Predicted σ of a designed motion, and of motions of other lengths.
 
     Attributes:
-        noise: (n,) taken as the torques' error [N m or N]; noise_share: of the torque limits.
-        own: of the motion as it is to be run; by_period: of other lengths. Longer ones run the same motion again,
-            shorter ones are designed quickly.
-        before: torque_sigma_share of an identification that the motion adds to, and torque_sigma_before (n,) [N m or
-            N] its torque_sigma; None without one.
+        noise_share: assumed torque error as a share of the torque limits.
+        noise: (n,) assumed torque error [N m or N].
+        own: prediction for the motion as it is to be run.
+        by_period: predictions for other lengths: longer ones repeat the same motion, shorter ones are designed quickly.
+        before: `torque_sigma_share` of the identification that the motion complements; None without one.
+        torque_sigma_before: (n,) `torque_sigma` of that identification [N m or N]; None without one.
     """
 
     noise_share: float
@@ -119,14 +123,14 @@ def foretell(
     motion: SearchResult,
     problem_of: Callable[[float], ExcitationProblem],
 ) -> tuple[MotionOutlook | None, Sequence[PredictedSigma]]:
-    """Return the predicted sigmas of torques and parameters; None if a joint has no torque limit.
+    """Return the predicted σ of torques (None if a joint has no torque limit) and of the parameters (then empty).
 
     Args:
         inputs: the robot, its limits and model.
-        settings: of the design.
-        problem: that was solved.
-        motion: that solves it.
-        problem_of: a period [s] -> the problem with it.
+        settings: settings of the design.
+        problem: optimisation problem of the design.
+        motion: solution of the problem.
+        problem_of: function of a period [s] that returns the problem with this period.
     """
     limits, noise = inputs.limits.torque, inputs.limits.noise
     if not np.isfinite(limits).all():
@@ -175,7 +179,7 @@ def _parameter_rows(
     Args:
         inputs: the robot and its model.
         root, shifts: see `_prediction`.
-        sigmas_before: (c,) stated by the identification that the motion adds to.
+        sigmas_before: (c,) σ of the identification that the motion complements; None without one.
     """
     model, columns = inputs.model, inputs.columns.kept
     values = np.full(len(model.exact.names), np.nan)
@@ -198,7 +202,9 @@ def _parameter_rows(
 
 
 def known_sigmas(inputs: ExcitationInputs, task: Task) -> tuple[tuple[np.ndarray, float], list[float]]:
-    """Return the σ of torques on a task (see `_torque_sigma`), and of the parameters, that an identification states."""
+    """Return the σ that an earlier identification states: of torques on a task (see `_torque_sigma`), and of
+    parameters.
+    """
     root = _root(_information_root(inputs))
     shifts = _shifts_before(inputs)
     sigmas = np.linalg.norm(np.hstack([root, shifts]), axis=1)
@@ -206,7 +212,7 @@ def known_sigmas(inputs: ExcitationInputs, task: Task) -> tuple[tuple[np.ndarray
 
 
 def _information_root(inputs: ExcitationInputs) -> np.ndarray:
-    """Return a root (c, c) of the information matrix of earlier motions, for the columns of the design."""
+    """Return a square root W (c, c) of the earlier motions' information matrix Wᵀ W, for the columns of the design."""
     assert inputs.prior is not None
     columns = inputs.columns.kept
     values, V = np.linalg.eigh(inputs.prior.information[columns][:, columns])
@@ -228,7 +234,7 @@ def _geometry_torques(inputs: ExcitationInputs, q: np.ndarray, v: np.ndarray, a:
 
 
 def _shifts_before(inputs: ExcitationInputs) -> np.ndarray:
-    """Return what the principal errors of the geometry did to the parameters (c, r) of an earlier identification."""
+    """Return the shifts (c, r) of an earlier identification's parameters by the principal errors of the geometry."""
     if inputs.geometry is None:
         return np.zeros((len(inputs.columns.names), 0))
     return inputs.geometry.before[inputs.columns.kept]
@@ -241,9 +247,9 @@ def _torque_sigma(
 
     Args:
         inputs: the robot and its model.
-        task: the states.
-        root: (c, c) of the parameters' covariance.
-        shifts: (c, r) of the parameters by the geometry's errors.
+        task: states of the task.
+        root: (c, c) square root of the parameters' covariance.
+        shifts: (c, r) shifts of the parameters by the geometry's errors.
     """
     by_torque_errors = task.regressors @ root
     by_geometry = task.regressors @ shifts + task.felt
@@ -254,7 +260,7 @@ def _torque_sigma(
 
 
 def task_states(inputs: ExcitationInputs, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return q, v, a (TASK_STATES, n) of a typical task."""
+    """Return q, v, a (TASK_STATES, n) of a typical task, drawn with the seed."""
     n = inputs.chain.n
     box = inputs.limits.positions
     low = np.where(np.isfinite(box.lower), box.lower, -np.pi)
@@ -272,7 +278,7 @@ def task_states(inputs: ExcitationInputs, seed: int) -> tuple[np.ndarray, np.nda
 
 
 def task_of(inputs: ExcitationInputs, seed: int) -> Task:
-    """Return the typical task of `task_states`."""
+    """Return the typical task: regressors and effects of the geometry's errors at the states of `task_states`."""
     states = task_states(inputs, seed)
     regressors = inputs.model.exact.regressor(*states)[:, :, inputs.columns.kept]
     return Task(regressors, _geometry_torques(inputs, *states))
@@ -283,7 +289,8 @@ def _prediction(
 ) -> tuple[MotionPrediction, np.ndarray, np.ndarray]:
     """Return the prediction for `repeat` periods of a motion, and the two parts of the parameters' errors.
 
-    They are a root (c, c) of the covariance by the torques' errors, and the shifts (c, r) by the geometry's errors.
+    The parts are a square root (c, c) of the covariance by torque errors, and the shifts (c, r) by the geometry's
+    errors.
     """
     exact, columns = inputs.model.exact, inputs.columns.kept
     period = family.period * factor
@@ -327,7 +334,9 @@ def _shortened(
     period: float,
     evaluations: int,
 ) -> tuple[Family, SearchResult] | None:
-    """Return a motion of a shorter period, or None; the search starts from the same path, scaled to keep its speeds."""
+    """Return family and motion of a shorter period; None if there is none. The search starts from the same, scaled
+    path.
+    """
     try:
         shorter = replace(problem_of(period), stretch=(1.0, 1.0))
     except ValueError:  # as many harmonics of a short period are beyond the resonance, or it is no whole sample
@@ -344,16 +353,18 @@ def _shortened(
 
 
 def write(rows: Sequence[PredictedSigma], folder: Path) -> Path:
-    """Write the parameters' predicted sigmas as CSV; value and rsd [%] are empty where the value is not known."""
+    """Write the parameters' predicted σ as CSV and return its path; value and rsd [%] are empty if a value is
+    unknown.
+    """
     header = list(PredictedSigma._fields)
     header[header.index("rsd")] = "rsd [%]"
     return files.write_table(folder / NAME, header, rows)
 
 
 def lines(outlook: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> list[str]:
-    """Return the predicted σ of torques as text, for this motion and for motions of other lengths.
+    """Return the predicted σ of torques as lines of text, for this motion and for motions of other lengths.
 
-    After an identification, the three parameters whose σ the motion lowers most follow.
+    If the motion complements an identification, the three parameters whose σ decreases most follow.
     """
     by_period = ""
     if outlook.by_period:
@@ -374,7 +385,7 @@ def lines(outlook: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> l
 
 
 def check_folder(folder: Path) -> None:
-    """Raise an error if a folder contains no prediction of `calib excite`."""
+    """Raise a UsageError if a folder contains no prediction of `calib excite`."""
     require((folder / NAME).is_file(), f"{folder} has no {NAME}: give the folder that calib excite wrote", UsageError)
 
 
@@ -384,10 +395,10 @@ class _Predicted:
 
 
 def compared_with_identification(folder: Path, outcome: IdentificationOutcome) -> str:
-    """Return a line that compares the predicted sigmas (folder of `calib excite`) with the identified ones.
+    """Return a line that compares the predicted σ (folder of `calib excite`) with the identified σ.
 
     Raises:
-        UsageError: if the folder contains no prediction, or one of other parameters.
+        UsageError: if the folder contains no prediction, or a prediction for other parameters.
     """
     check_folder(folder)
     outlook = read_json(folder / METRICS, WRITTEN_BY_EXCITE, _Predicted).prediction

@@ -1,4 +1,4 @@
-"""Information of earlier motions, recorded or designed, that a new one adds to."""
+"""Information of earlier motions, recorded or designed, which a new motion complements."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,15 +29,15 @@ MIN_RATE = 50
 
 
 class PrincipalErrors(Protocol):
-    """Principal errors of a calibrated geometry, g_1 … g_r: √λ_i u_i of its covariance Σ λ_i u_i u_iᵀ."""
+    """Principal errors g_i = √λ_i u_i, i = 1 … r, of a calibrated geometry with the covariance Σ λ_i u_i u_iᵀ."""
 
     @property
     def before(self) -> np.ndarray:
-        """Changes (b, r) of the parameters of an earlier identification by each error; zero without one."""
+        """Shifts (b, r) of an earlier identification's parameters by each principal error; zero without one."""
         ...
 
     def felt(self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the torques' changes (N, rows, r) by each error at fixed base parameters `values` (b,)."""
+        """Return the changes of the torques (N, rows, r) by each error, at fixed base parameters `values` (b,)."""
         ...
 
 
@@ -46,10 +46,10 @@ class PriorMotions:
     """Information matrix of earlier motions, recorded or designed.
 
     Attributes:
-        names: of the files or folders.
-        seconds: of motion.
-        information: (b, b) ∫ ωᵀω dt, of the design's columns, rows in units of `sigmas`.
-        sigmas: (rows,) root of the torque errors' density, where an identification states it; None: 1.
+        names: names of the files or folders of the motions.
+        seconds: duration of the motions.
+        information: (b, b) ∫ ωᵀω dt of the design's columns, with the rows divided by `sigmas`.
+        sigmas: (rows,) square root of the torque errors' density that an identification states; None: 1.
     """
 
     names: tuple[str, ...]
@@ -72,11 +72,16 @@ def read_prior(
 ) -> PriorMotions | None:
     """Return the information from recordings (``log.npz@0:9.4`` cuts) and folders of `calib excite`; None if none.
 
-    Recordings are filtered and differentiated as `calib identify` does it. What an identification `after` knows, its
-    prior included, is the inverse of its covariance, without the part of the geometry.
+    Recordings are filtered and differentiated as by `calib identify`. The information of an identification `after`, its
+    prior included, is the inverse of its covariance without the geometry's part.
 
     Args:
-        noise: (rows,) by which torque rows are divided where no identification states it; None: 1.
+        paths: recordings, or folders of `calib excite`.
+        model: the model to excite.
+        chain: the arm.
+        after: folder of an identification; None without one.
+        noise: (rows,) by which torque rows are divided if no identification states their errors; None: 1.
+        geometry: principal errors of the geometry; None if the geometry is taken as exact.
 
     Raises:
         UsageError, MeasurementError: for a path that is neither, or belongs to another robot.
@@ -112,7 +117,9 @@ def _identified_information(
     """Return the information (b, b) of an identification, and the square root of its torque error density (rows,).
 
     Args:
-        geometry: where it is given, its part is not in the information.
+        folder: folder of the identification.
+        model: the model to excite.
+        geometry: principal errors; if given, the geometry's part of the covariance is excluded; None: included.
     """
     metrics = IdentificationFolder(folder).metrics()
     density = metrics.error_density

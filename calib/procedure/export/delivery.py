@@ -93,12 +93,12 @@ class Export:
     """Sources of an export: nominal robot, fit and identification.
 
     Attributes:
-        source: description of the nominal robot: a URDF is edited in place, else a URDF is written anew.
-        fit: folder of the fit; None: identified dynamics alone.
-        identified: folder of the identification; None: geometry alone.
+        source: description of the nominal robot: a URDF is edited in place; without one, a URDF is written anew.
+        fit: folder of the fit; None: export of the identified dynamics only.
+        identified: folder of the identification; None: export of the geometry only.
         prior: regularisation of masses that the torques do not identify, see
             `calib.identification.physical_consistency.solve.PRIORS`.
-        remark: for the head of files that a robot or a simulation moves by.
+        remark: text for the head of files that a robot or a simulation uses for motion; empty: none.
     """
 
     source: Path | None
@@ -166,7 +166,9 @@ def _corrected_urdf(export: Export, path: Path) -> list[str]:
 
 
 def _geometric_urdf(export: Export, path: Path, name: str) -> list[str]:
-    """Write a URDF of the calibrated geometry: `URDF`, or `CORRECTED_URDF` for joint corrections beside it."""
+    """Write a URDF of the calibrated geometry and return notes: `URDF`, or `CORRECTED_URDF` for use with
+    corrections.
+    """
     if export.urdf is not None:
         content, programs = geometry.edited_urdf(export.robot, export.urdf, for_corrections=name != URDF)
         change = f"joint origins of {export.urdf} are calibrated; base link, flange and all else are unchanged"
@@ -211,7 +213,7 @@ def _mjcf(export: Export, path: Path) -> list[str]:
 
 
 def write_drives(joints: Sequence[Joint], drives: identified.Drives, path: Path) -> None:
-    """Write ``drives.csv``: the drives' values of joints, and of couplings, with their sigmas."""
+    """Write ``drives.csv``: the drive parameters of joints, and of couplings, with their σ."""
     names = [joint.name for joint in joints]
     kinds = [joint.kind for joint in joints]
     for first, second, weight in drives.pairs:
@@ -256,12 +258,13 @@ class ExportFile:
     """One file of an export.
 
     Attributes:
-        name: in the folder.
-        write: writes it to a path if the robot has such data, and returns remarks.
-        use: for README.txt.
+        name: file name.
+        write: function that writes the file to a path if the robot has such data, and returns remarks.
+        use: text on the file's use for README.txt.
         stages: stages whose results it contains.
-        deliverable: whose verdict holds for it; empty: neither robot nor simulation moves by it.
-        marked: its head states a verdict other than pass.
+        deliverable: name of the deliverable whose verdict applies to it; empty: no robot or simulation moves by the
+            file.
+        marked: whether its head states a verdict other than pass.
     """
 
     name: str
@@ -297,10 +300,10 @@ def deliver(export: Export, out: Path) -> list[str]:
     """Write the calibrated robot into the folder `out`, in all formats (see the module).
 
     Returns:
-        What was written and what to know of it, in words.
+        Remarks on the written files, as text.
 
     Raises:
-        RobotError: where a file does not read back as the robot; nothing is written.
+        RobotError: if a file, read back, differs from the robot; nothing is written.
     """
     notes: list[str] = []
 
@@ -316,10 +319,10 @@ def deliver(export: Export, out: Path) -> list[str]:
 
 
 def deliver_single(export: Export, targets: Mapping[str, Path]) -> list[str]:
-    """Write single files of an export, each to the path given in `targets`.
+    """Write single files of an export, each to the path given in `targets` (file name -> path).
 
     Returns:
-        What was written and what to know of it, in words.
+        Remarks on the written files, as text.
     """
     notes = []
     for file in export.files:
@@ -332,8 +335,9 @@ def check_into(export: Export, into: Path, folder: Path) -> None:
     """Refuse, before any work is done, an export folder that is not usable, or that contains inputs or other files.
 
     Args:
-        into: where the files are to go.
-        folder: of the fit or the identification.
+        export: sources of the export.
+        into: folder to write the files to.
+        folder: folder of the fit or the identification.
 
     Raises:
         UsageError: with the file or folder concerned.
@@ -349,7 +353,7 @@ def check_into(export: Export, into: Path, folder: Path) -> None:
 def fit_verdicts(folder: Path) -> Verdicts:
     """Return the verdicts on a fit and its deliverables, from its folder; in a session, on unseen poses.
 
-    Empty where the folder is of an earlier version and does not say it, or where its session has yet to judge it.
+    Empty if the folder is of an earlier version without verdict, or if its session has not yet judged the fit.
     """
     try:
         record = _fit_record(folder)
@@ -359,7 +363,10 @@ def fit_verdicts(folder: Path) -> Verdicts:
 
 
 def model_verdicts(folder: Path) -> Verdicts:
-    """Return the verdict on an identification, from its folder; in a session, on unseen motion. Empty as of a fit."""
+    """Return the verdict on an identification, from its folder; in a session, on unseen motion.
+
+    Empty if the folder is of an earlier version without verdict, or if its session has not yet judged the model.
+    """
     try:
         record = _identification_record(folder)
     except UsageError:
@@ -368,7 +375,9 @@ def model_verdicts(folder: Path) -> Verdicts:
 
 
 def _identification_record(folder: Path) -> UnseenReport | ModelMetrics:
-    """Return the record of an identification: on unseen motion where a session has judged it."""
+    """Return the stored record of an identification: on unseen motion if a session has judged it, else of its
+    folder.
+    """
     identification = IdentificationFolder(folder)
     if identification.unseen.report.is_file():
         return identification.unseen.read()
@@ -376,7 +385,7 @@ def _identification_record(folder: Path) -> UnseenReport | ModelMetrics:
 
 
 def _fit_record(folder: Path) -> ValidationMetrics | FitMetrics:
-    """Return the record of a fit: on unseen poses where a session has judged it."""
+    """Return the stored record of a fit: on unseen poses if a session has judged it, else of its folder."""
     validation = ValidationFolder(folder.absolute().parent / VALIDATED)
     if folder.absolute().name == IN_SESSION and validation.judged.is_file():
         return validation.metrics()
@@ -384,7 +393,7 @@ def _fit_record(folder: Path) -> ValidationMetrics | FitMetrics:
 
 
 def _stage_verdict(stage: str, record: JudgedMetrics | ValidationMetrics) -> dict[str, Verdict]:
-    """Return the verdict of a stage by its name; none where the record says none."""
+    """Return stage name → verdict of a record; {} if the record has no verdict."""
     return {stage: Verdict(record.verdict, record.reason)} if record.verdict else {}
 
 
@@ -412,10 +421,10 @@ def mark(out: Path, verdicts: Verdicts) -> list[str]:
 
     Args:
         out: the folder of the export.
-        verdicts: on the stages and deliverables.
+        verdicts: verdicts on the stages and deliverables.
 
     Returns:
-        What does not pass, in words.
+        A text for each file whose verdict is not pass.
     """
     of_files = by_file(out, verdicts)
     for file in FILES:
@@ -442,7 +451,7 @@ def mark(out: Path, verdicts: Verdicts) -> list[str]:
 
 
 def _uses(out: Path, of_files: Mapping[str, Verdicts]) -> Iterator[str]:
-    """Yield the use of each exported file, and the verdict on it."""
+    """Yield a line of README.txt for each exported file: its use, and the verdict on it."""
     with_dynamics = (out / PARAMETERS).exists()
     for file in FILES:
         name = file.name
@@ -464,7 +473,7 @@ def _uses(out: Path, of_files: Mapping[str, Verdicts]) -> Iterator[str]:
 
 
 def _remarked(content: bytes, remark: str) -> bytes:
-    """Return an XML or YAML file with a remark, one line, at its head, as a comment."""
+    """Return the content of an XML or YAML file with a one-line remark as a comment at its head."""
     if not remark:
         return content
     # behind a byte order mark, perhaps in UTF-16; our YAML begins with a comment

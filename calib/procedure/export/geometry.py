@@ -30,18 +30,18 @@ OFFSETS_HEADER = ("joint", "unit", "add_to_reading", "add_to_command", "sigma")
 
 
 class NoSuchArm(UsageError):
-    """Error for an arm of a kind that a file format does not support."""
+    """Error for an arm with another kinematic structure than a file format supports."""
 
 
 def read(folder: Path, verb: str = "export") -> CalibratedChain:
     """Read the calibrated robot from the folder of a fit.
 
     Args:
-        folder: of a fit.
-        verb: what asks, for the message (`calib.result_kinds.TAKES`).
+        folder: folder of a fit.
+        verb: name of the command that reads, for the message (`calib.result_kinds.TAKES`).
 
     Raises:
-        UsageError: where it is none, or does not say what it was calibrated from.
+        UsageError: if it is not the folder of a fit, or does not state the nominal robot.
     """
     if not FitFolder(folder).robot.is_file():
         raise UsageError(refusal(folder, verb))
@@ -59,13 +59,19 @@ def results(folder: Path) -> list[Path]:
 def edited_urdf(robot: CalibratedChain, source: Path, for_corrections: bool = False) -> tuple[bytes, str]:
     """Return the XML of `source` with the calibrated geometry, and a sentence on the programs that verified it.
 
-    Only the origins of the arm's joints change. The base link stays where the nominal robot has its base, and the fixed
-    joints behind the last moving one stay as they are: the choice of base and flange is the source's.
+    Only the origins of the arm's joints change. The base link and the fixed joints after the last moving joint stay as
+    in
+    the source, since the source defines base and flange.
 
     Args:
         robot: the calibrated robot.
         source: a URDF of the nominal robot.
-        for_corrections: take the geometry that the joint corrections belong to, which is worse without them.
+        for_corrections: whether to write the geometry that is to be used with joint corrections; without them it is
+            less
+            accurate than the rigid geometry.
+
+    Raises:
+        RobotError: if the edited URDF, read back, has other poses than the robot.
     """
     chain = robot.complete if for_corrections else robot.chain
     content, encoding = text(source)
@@ -84,7 +90,11 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
     """Refuse a URDF text with other poses in Pinocchio or yourdfpy than in this toolkit (`MAX_DIFFERENCE`).
 
     Returns:
-        The programs that have read it. A text that yourdfpy cannot read is accepted, and the reason is stated.
+        A sentence on the programs that have read it. A text that yourdfpy cannot read is accepted, and the reason
+        stated.
+
+    Raises:
+        RobotError: if the poses differ.
     """
     tree = read_tree(edited, where)
     urdf_chain = chain_in(tree, chain)
@@ -111,11 +121,12 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
 
 
 def export_offsets(robot: CalibratedChain, out: Path) -> Path:
-    """Write the offset of each joint: to add to what the controller reads, and with the other sign to commands.
+    """Write each joint's offset: to be added to the controller's reading, and subtracted from commands; return the
+    path.
 
-    Calibrated minus nominal: a joint that reads q stands at q + offset in the nominal robot's terms.
-    Where the fit has joint corrections, offsets and their sigmas are those of the best geometry without them: for
-    whoever does not apply them.
+    The offset is calibrated minus nominal: a joint with the reading q is at q + offset in the nominal robot's model. If
+    the fit has joint corrections, offsets and their σ are those of the best geometry without corrections, for users who
+    do not apply them.
     """
     nominal = nominal_of(robot)
     sigma = np.full(len(robot.chain.elements), np.nan)

@@ -46,10 +46,10 @@ class Drives:
 
     Attributes:
         values: (n, 4) armature [kg m² or kg], damping [N m s/rad or N s/m], friction, offset [N m or N].
-        left: names of terms that do not fit the table: richer friction.
-        couplings: (c, 4) the same values for motors that turn with two joints (`calib.dynamics.drives.coupled`).
-        pairs: (c,) their joints, from 0, and the weight of the second: 1 for the sum, -1 for the difference.
-        sigma: (n + c, 4) of all values; None where no covariance is known.
+        left: names of terms that the table cannot contain, such as richer friction.
+        couplings: (c, 4) the same parameters of motors that turn with two joints (`calib.dynamics.drives.coupled`).
+        pairs: (c,) indices of the two joints, and the weight of the second: 1 for the sum, -1 for the difference.
+        sigma: (n + c, 4) σ of all values; None without a covariance.
     """
 
     values: np.ndarray
@@ -64,11 +64,11 @@ class IdentifiedRobot:
     """Identified robot with physically consistent bodies, ready for export.
 
     Attributes:
-        robot: the geometry, with that before calibration.
+        robot: calibrated geometry, with the nominal geometry.
         information: the estimate.
-        found: all its parameters, of physically consistent bodies.
-        bodies: (B, 10) of the arm's bodies, without payloads.
-        drives: by joint.
+        found: all parameters of the physically consistent model.
+        bodies: (B, 10) standard parameters of the arm's bodies, without payloads.
+        drives: drive parameters by joint.
     """
 
     robot: CalibratedChain
@@ -100,7 +100,7 @@ def read(folder: Path, prior: str = "entropic") -> IdentifiedRobot:
 
 @dataclass(frozen=True)
 class ExportedPrediction:
-    """Unexplained share of the torque [%] on a recording: by the exported robot, and by the identified model."""
+    """Unexplained share of a recording's torque [%]: by the exported robot, and by the identified model."""
 
     file: str
     exported: float
@@ -116,7 +116,7 @@ class ExportedPrediction:
 def exported_prediction(robot: IdentifiedRobot, folder: Path) -> ExportedPrediction | None:
     """Return the torque prediction error of the exported robot, on the worst recording in `folder`.
 
-    None where these recordings carry payloads or are by a version that did not keep their speeds.
+    None if the recordings carry payloads, or if an earlier version did not store their speeds.
     """
     dynamics = without_left(robot.found.dynamics)
     worst = None
@@ -226,10 +226,10 @@ def parameters(robot: IdentifiedRobot) -> dict[str, object]:
 
 
 def as_mjcf(robot: IdentifiedRobot, where: str) -> str:
-    """Return the MJCF of an identified robot.
+    """Return the MJCF of an identified robot; `where` names it in messages.
 
     Raises:
-        RobotError: where Pinocchio reads other poses, torques or drives.
+        RobotError: if Pinocchio reads other poses, torques or drives from it.
     """
     armature, damping, friction, _ = robot.drives.values.T
     model = mjcf_text(robot.chain, robot.bodies, armature, damping, friction)
@@ -243,11 +243,11 @@ def as_urdf(robot: IdentifiedRobot, content: str, where: str, nominal: Chain) ->
     Args:
         robot: the identified robot.
         content: the URDF of the nominal robot.
-        where: names it in messages.
+        where: name of the file for messages.
         nominal: the arm that `content` describes.
 
     Raises:
-        RobotError: where Pinocchio reads other poses, torques or drives.
+        RobotError: if Pinocchio reads other poses, torques or drives from the result.
     """
     chain = robot.chain
     calibrated_text = urdf_write.edit(content, nominal, chain, where)
@@ -265,7 +265,7 @@ def as_urdf(robot: IdentifiedRobot, content: str, where: str, nominal: Chain) ->
 
 
 def _link_bodies(robot: IdentifiedRobot, tree: UrdfTree, chain: Chain) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Return the inertials to write by link, about the links' frames, and notes."""
+    """Return the inertial parameters (10,) to write by link name, in the links' frames, and notes."""
     joints_to_tip = tree.path(chain.base, chain.tip)
     moving = [joint for joint in joints_to_tip if joint.moves]
     zero = np.zeros((1, chain.n))
@@ -303,7 +303,7 @@ def _link_bodies(robot: IdentifiedRobot, tree: UrdfTree, chain: Chain) -> tuple[
 
 
 def _sum(tree: UrdfTree, placements: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the summed standard parameters (10,) of links in the URDF."""
+    """Return the sum (10,) of the standard parameters of links, each moved by its placement (4, 4)."""
     total = np.zeros(10)
     for name, T_link in placements.items():
         body = tree.bodies[name]
@@ -348,11 +348,11 @@ def without_left(dynamics: Dynamics) -> Dynamics:
 
 
 def drive_table(dynamics: Dynamics, covariance: np.ndarray | None = None) -> Drives:
-    """Return the drive parameters of an identified model by joint, motor side plus link side.
+    """Return the drive parameters of an identified model by joint, each the sum of motor-side and link-side terms.
 
     Args:
         dynamics: the model.
-        covariance: of all its parameters.
+        covariance: (p, p) of all its parameters; None: no σ.
     """
     model = dynamics.model
     n = model.bodies.n
@@ -385,7 +385,9 @@ def drive_table(dynamics: Dynamics, covariance: np.ndarray | None = None) -> Dri
 
 
 def _pair(term: DriveTerm) -> tuple[int, int, float] | None:
-    """Return the joints that a term couples and the weight of the second; None for any other term."""
+    """Return the joints that a drive term couples, and the weight of the second; None if the term has one joint
+    only.
+    """
     if term.shape not in PLAIN or len(term.acts) != 2:
         return None
     (first, motion), (second, _) = term.acts

@@ -1,7 +1,7 @@
-"""Joint origins as YAML: tesseract's calibration file, and the form of ur_description's.
+"""Joint origins as YAML: for tesseract's calibration file, and for ur_description's kinematics file.
 
-Nested mappings in block style, which every reader takes, in YAML 1.1 and 1.2 alike. A number always has a point, since
-YAML 1.1 takes 1e-05 for text; a key that could be read as something else is quoted.
+Nested mappings are written in block style, which readers of YAML 1.1 and 1.2 understand. Numbers always have a decimal
+point, since YAML 1.1 reads 1e-05 as text; keys that could be read as another type are quoted.
 """
 
 import json
@@ -47,11 +47,11 @@ def joint_origins(source: str, edited: str, where: str) -> str:
     """Return the YAML with the origins of all joints that differ between two URDF texts.
 
     Args:
-        source, edited: the nominal robot, and the calibrated one with the same joints.
-        where: names them in messages.
+        source, edited: URDF texts of the nominal robot, and of the calibrated robot with the same joints.
+        where: name of the file for messages.
 
     Raises:
-        RobotError: for an origin that is not a rotation.
+        RobotError: for an origin whose orientation is not a rotation matrix.
     """
     before, after = read_tree(source, where), read_tree(edited, where)
     moved = {}

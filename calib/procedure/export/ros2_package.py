@@ -55,13 +55,16 @@ def write_package(
     """Write the package `name` of a calibrated robot into the folder `into`; return notes on it.
 
     Args:
-        moveit: SRDF, joint_limits.yaml, or a folder with both, to be copied.
-        control: write a <ros2_control> for mock hardware where the URDF has none.
-        overwrite: replace files that are there.
+        export: sources of the export.
+        name: name of the package.
+        into: folder that is to contain the package's folder.
+        moveit: files to copy: SRDF, joint_limits.yaml, or a folder with both.
+        control: whether to write a <ros2_control> for mock hardware if the URDF has none.
+        overwrite: whether to replace existing files.
 
     Raises:
-        UsageError: for a name that no ROS 2 package has, and for MoveIt's files of another robot.
-        RobotError: where the finished URDF does not read back as the robot; nothing is written.
+        UsageError: for a name that no ROS 2 package can have, and for MoveIt files of another robot.
+        RobotError: if the finished URDF, read back, differs from the robot; nothing is written.
     """
     likely = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
     words = f"--ros2 {name}: a package's name has lower-case letters, digits and single _, a letter first (REP 149)"
@@ -104,7 +107,9 @@ def write_package(
 def _with_own_meshes(
     path: Path, content: str, name: str, source: Path | None
 ) -> tuple[str, dict[str, Path], list[str]]:
-    """Return a URDF's text that names its meshes in the package, these by their place in it, and those not found."""
+    """Return a URDF's text with meshes renamed into the package, the meshes by their path in it, and those not
+    found.
+    """
     folders = [] if source is None else list(Path(split(str(source))[0]).resolve().parents)
     changes, meshes, lost = list[tuple[int, int, str]](), dict[str, Path](), list[str]()
     for _, _, node in (*urdf_meshes(path, "visual"), *urdf_meshes(path, "collision")):
@@ -125,7 +130,7 @@ def _with_own_meshes(
 
 
 def _with_control(content: str, robot: str, chain: Chain) -> str:
-    """Return a URDF's text with a <ros2_control> for mock hardware, which takes positions."""
+    """Return a URDF's text with a <ros2_control> for mock hardware with position commands."""
     joints = "".join(
         f'    <joint name={quoteattr(name)}>\n      <command_interface name="position"/>\n'
         '      <state_interface name="position"/>\n      <state_interface name="velocity"/>\n    </joint>\n'

@@ -31,20 +31,22 @@ HEAD = """\
 
 
 def kinematics(robot: CalibratedChain, urdf: Path | None = None) -> tuple[str, str]:
-    """Return the kinematics YAML for ur_description, and a remark on the flange.
-
-    Args:
-        robot: the calibrated robot, whatever links it begins and ends at.
-        urdf: of it, which says where ``base_link_inertia`` is; without that link it is where the axes say.
-
-    The YAML says x y z roll pitch yaw of the six joint origins [m, rad].
+    """Return the kinematics YAML for ur_description (x y z roll pitch yaw of six joint origins [m, rad]), and a remark.
 
     The frames are UR's own (base_link_inertia, then each joint about its z). They follow from the nominal arm's axes,
-    so that only the calibrated part of the numbers is new. ur_description puts its tool0 where wrist_3 is: fixed joints
-    of the robot's file behind it (a flange, a tool) are not part of it, which the remark says.
+    so
+    that only the calibrated part of the numbers is new. ur_description puts its tool0 at wrist_3; fixed joints after it
+    in
+    the robot's file (a flange, a tool) are not included, which the remark says.
+
+    Args:
+        robot: the calibrated robot, with any base and tip links.
+        urdf: URDF of the robot, for the pose of ``base_link_inertia``; None, or without this link: the pose follows
+            from
+            the axes.
 
     Raises:
-        NoSuchArm: for an arm that has not UR's axes.
+        NoSuchArm: for an arm without the axes of a UR arm.
     """
     with refused_as(NoSuchArm, RobotError, f"'{robot.chain.name}' does not have the axes of a UR arm: {{}}"):
         source = _template(nominal_of(robot), urdf)
@@ -56,7 +58,7 @@ def kinematics(robot: CalibratedChain, urdf: Path | None = None) -> tuple[str, s
 
 
 def _flange_note(robot: CalibratedChain) -> str:
-    """Return a remark on where UR's flange is assumed, if a fixed joint follows the last joint."""
+    """Return a remark on the assumed position of UR's flange if a fixed joint follows the last joint; else empty."""
     nominal = nominal_of(robot)
     zero = np.zeros((1, nominal.n))
     behind = invert(joint_frames(nominal, zero)[-1, 0]) @ forward(nominal, zero)[0]
@@ -78,12 +80,13 @@ def _wrist_offset(nominal: Chain) -> float:
 def _inertia_frame(nominal: Chain, urdf: Path | None, up: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     """Return the pose (4, 4) of UR's base_link_inertia in the arm's base.
 
-    UR's descriptions have a link of that name, turned by 180° about z against base_link. Without it, its z is axis 1,
-    its -x the direction in which the arm lies at q = 0, and its origin the base's.
+    UR's descriptions have a link with this name, turned by 180° about z relative to base_link. Without such a link, its
+    z
+    is axis 1, its -x the direction in which the arm lies at q = 0, and its origin that of the base.
 
     Args:
         nominal: the arm.
-        urdf: of it, or None.
+        urdf: its URDF; None without one.
         up, ahead: (3,) direction of axis 1, and from axis 2 to axis 3 at q = 0, in the arm's base.
     """
     if urdf is not None and urdf.is_file():
@@ -103,9 +106,9 @@ def _inertia_frame(nominal: Chain, urdf: Path | None, up: np.ndarray, ahead: np.
 def _template(nominal: Chain, urdf: Path | None) -> str:
     """Return a URDF of a nominal arm in UR's frames, with the six lengths of the arm's axes at q = 0.
 
-    d1 height of axis 2; a2, a3 distances of axes 2 to 3 and 3 to 4; d4 distance of axis 5 from axis 1; d5 height of
-    axis 4 over axis 6; d6 distance of the last joint's frame from axis 5, or of the tip where that frame is on axis 5
-    (URDFs of the years before ur_description hold d6 in the fixed joint to tool0).
+    d1: height of axis 2; a2, a3: distances of axes 2 to 3 and 3 to 4; d4: distance of axis 5 from axis 1; d5: height of
+    axis 4 over axis 6; d6: distance of the last joint's frame from axis 5, or, if this frame is on axis 5, of the tip
+    (early UR URDFs have d6 in the fixed joint to tool0).
     """
     if nominal.n != 6 or any(joint.kind != "revolute" for joint in nominal.joints):
         raise RobotError(f"it has {nominal.n} joints; expected six revolute joints")
@@ -155,6 +158,6 @@ def _axis(chain: Chain, frame: np.ndarray, k: int) -> np.ndarray:
 
 
 def _gap(one: np.ndarray, two: np.ndarray, direction: np.ndarray) -> float:
-    """Return the distance of two parallel lines [m]."""
+    """Return the distance of two parallel lines [m], each given by a point (3,), with the unit direction (3,)."""
     between = two - one
     return float(np.linalg.norm(between - direction * (direction @ between)))

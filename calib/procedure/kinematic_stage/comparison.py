@@ -38,11 +38,11 @@ class Intervals:
     """Position errors on a set of rows, with the predicted σ and 95 % intervals.
 
     Attributes:
-        sigma: (m,) standard deviation of the tool position error, all axes together [m].
-        radius: (m,) within which 95 % of such errors are to be [m].
-        size: (m,) the errors [m].
-        beyond: (m,) whether a joint stands outside the training range.
-        joints: names of those that do.
+        sigma: (m,) predicted standard deviation of the tool position error, all axes together [m].
+        radius: (m,) predicted radius that contains 95 % of the errors [m].
+        size: (m,) magnitudes of the errors [m].
+        beyond: (m,) whether a joint is outside the training range.
+        joints: names of the joints that are outside the training range.
     """
 
     sigma: np.ndarray
@@ -75,23 +75,26 @@ class Comparison:
 
     Attributes:
         blocks: the rows.
-        cells: nominal and calibrated installation that predict them.
-        errors: of each.
-        pairs: errors of the distances between pairs of positions, of each [m].
-        poses: how many robot poses.
-        frames: whose base and tool placement was used, in words.
-        proves: False where the rows were fitted on, or where the placement did not settle or took up the errors.
-        alone: errors of the calibrated robot as a URDF holds it, without corrections and with frames fitted for it
-            on the same rows as theirs; None where that is all there is.
-        plain: errors of the plain reference, frames likewise; None on the fit's own rows, and where there is none.
-        shares_frames: True where another file's base and tool placement was used.
-        repeated: what poses that were measured several times say (`calib.procedure.kinematic_stage.comparison`); None
-            without any.
-        reprojection: rms distance of seen from predicted corners, of each arm [px]; None without images.
-        intervals: what the fit's error model expected of the calibrated arm on these rows; None without one.
-        settled: False where the placement of base and tool on these rows did not settle: their errors mean nothing.
-        placed_by: how many numbers were measured, and how many parameters of the placement were fitted to them, where
-            that leaves too little to prove anything (`MARGIN`).
+        cells: nominal and calibrated installation, which predict the rows.
+        errors: errors of the nominal and the calibrated arm.
+        pairs: errors of the distances between pairs of positions, of both arms [m].
+        poses: number of robot poses.
+        frames: text on the source of the base and tool placement.
+        proves: False if the rows were fitted, or if the placement did not settle or absorbed the errors.
+        alone: errors of the calibrated robot as a URDF describes it, without corrections and with frames fitted to the
+            same rows; None if the robot has no corrections.
+        plain: errors of the plain reference, with frames fitted to the same rows; None on the fit's own rows, and
+            without
+            a plain reference.
+        shares_frames: whether base and tool placement of another file were used.
+        repeated: repeatability and accuracy from poses that were measured several times; None without such poses.
+        reprojection: rms distance between detected and predicted corners, of both arms [px]; None without images.
+        intervals: errors of the calibrated arm with their predicted intervals; None without an error model of the fit.
+        settled: False if the placement of base and tool on these rows did not converge; then the errors are
+            meaningless.
+        placed_by: number of measured values, and of placement parameters fitted to them, if their difference is too
+            small
+            to judge by the errors (`MARGIN`); else None.
     """
 
     blocks: tuple[PoseMeasurements, ...]
@@ -147,7 +150,7 @@ class Comparison:
 
 
 def _position_means(blocks: Sequence[PoseMeasurements]) -> str:
-    """Return what the position errors of blocks are, in words."""
+    """Return as text what the position errors of blocks are errors of: positions, sockets or planes."""
     kinds = [block.kind for block in blocks if block.kind not in WITHOUT_POSITIONS]
     means = dict.fromkeys(MEASURED.get(kind, "position") for kind in kinds)
     return " or ".join(means) or "position"
@@ -156,7 +159,15 @@ def _position_means(blocks: Sequence[PoseMeasurements]) -> str:
 def compare(
     cells: Sequence[Installation], blocks: Sequence[PoseMeasurements], frames: str, proves: bool = True, seed: int = 0
 ) -> Comparison:
-    """Return the errors of the nominal arm, the calibrated arm and (if given) the URDF alone on the same rows."""
+    """Return the errors of the nominal arm, the calibrated arm and (if given) the URDF alone on the same rows.
+
+    Args:
+        cells: installations of these arms, in this order.
+        blocks: the rows.
+        frames: text on the source of the base and tool placement.
+        proves: whether a verdict may be based on the rows.
+        seed: seed of the pairs whose distances are compared.
+    """
     nominal, calibrated, *urdf_alone = [errors(cell, blocks) for cell in cells]
     arms = (cells[0], cells[1])
     pairs_nominal = pair_errors(arms[0], blocks, seed=seed)
@@ -191,12 +202,12 @@ def compare_unseen(
     """Return the errors of the arms on validation rows; base and tool placement are refitted where needed.
 
     Args:
-        cells: nominal and calibrated installation, and that of the URDF alone where it differs.
+        cells: nominal and calibrated installation, and that of the URDF alone if it differs.
         unseen: the rows.
-        settings: of the placement.
-        seed: of the pairs whose distances are compared.
-        expected: what errors the fit expects; None without an error model.
-        plain: the plain reference.
+        settings: settings of the placement.
+        seed: seed of the pairs whose distances are compared.
+        expected: the fit's error model; None without one.
+        plain: the plain reference; None without one.
     """
     block = unseen.block
     settled = True
@@ -258,7 +269,9 @@ def interval_cells(comparison: Comparison) -> np.ndarray:
 
 
 def iso9283_sentence(repeated: RepeatedPoses, arm: str) -> str:
-    """Return a sentence with repeatability RP and accuracy AP of repeated poses (ISO 9283); `arm`: what was fitted."""
+    """Return a sentence with repeatability RP and accuracy AP of repeated poses (ISO 9283); `arm`: name of the fitted
+    arm.
+    """
     fewest, largest = repeated.cycles
     cycles = f"{fewest}"
     if largest != fewest:

@@ -46,15 +46,15 @@ class Outcome:
     """Outcome of a fit.
 
     Attributes:
-        inputs: what it worked on.
-        selection: the rungs, the chosen model, and the fits of the nominal and the calibrated arm.
-        rigid: the best fit without joint corrections: the geometry that a URDF holds.
-        outliers: rows of the fit that do not fit, worst first.
-        undetermined: parameters that are not identifiable from the poses.
+        inputs: robot and measurements.
+        selection: the rungs of the ladder, the chosen model, and the fits of the nominal and the calibrated arm.
+        rigid: the best fit without joint corrections: the geometry that a URDF can describe.
+        outliers: fitted rows with large residuals, worst first.
+        undetermined: findings on parameters that are not identifiable from the poses.
         findings: warnings and notes on the fit.
-        assessment: both arms on fitted and on unseen rows, and the verdict.
-        settings, options: how it was fitted and judged.
-        expected: how far off the calibrated arm may be at any pose; None where no positions were measured.
+        assessment: errors of both arms on fitted and on unseen rows, and the verdict.
+        settings, options: settings and options of fit and verdict.
+        expected: error model of the calibrated arm at any pose; None if no positions were measured.
     """
 
     inputs: Inputs
@@ -81,9 +81,11 @@ class Outcome:
 
     @cached_property
     def nominal_cell(self) -> Installation:
-        """The arm before any calibration, base and tool placed where it fits the rows best.
+        """Installation of the arm before any calibration, with base and tool placed to fit the rows best.
 
-        A fit of an earlier fit's robot compares with that robot; its nominal arm is placed anew.
+        When the robot comes from an earlier fit, its nominal arm is placed anew, although the fit started from its
+        calibrated
+        geometry.
         """
         nominal = self.inputs.nominal
         if nominal is self.inputs.chain:
@@ -118,7 +120,7 @@ T = TypeVar("T", bound=Outcome)
 
 
 def weighing_settings(options: FitOptions, settings: FitSettings) -> Settings:
-    """Return the loss of the residuals: the one of the fit's settings, else that of the options file."""
+    """Return the settings of the residuals' loss: the loss of the fit's settings, else that of the options file."""
     return Settings(settings.loss or options.loss, options.loss_scale)
 
 
@@ -137,13 +139,13 @@ def run(
 
     Args:
         inputs: see `calib.procedure.kinematic_stage.inputs.gather`.
-        options: the fit options file's content.
-        settings: model, loss and folds of the ladder, tolerance, seed.
-        progress: called with a few words at each stage.
-        prediction: accuracy predicted when the poses were chosen, compared with the one that the fit states.
+        options: content of the fit options file; None: defaults.
+        settings: model, loss and folds of the ladder, tolerance, seed; None: defaults.
+        progress: called with the name of each stage; None: silent.
+        prediction: accuracy predicted when the poses were chosen, to be compared with the fit's; None: no comparison.
 
     Raises:
-        NotConverged: where the chosen model's fit did not come to an end.
+        NotConverged: if the fit of the chosen model did not converge.
     """
     options = options or FitOptions()
     settings = settings or FitSettings()
@@ -214,11 +216,13 @@ def _rigid_misfit(
 ) -> Finding | None:
     """Return the finding that no rigid geometry explains the rows, or that a few grossly wrong rows are the reason.
 
+    None if a rigid geometry explains them.
+
     Args:
-        selection: of models.
-        changes: of rows; those that explain the misfit stand in its place.
-        climb: selects models on the same rows with another loss.
-        weighing: of the selection.
+        selection: the selection of models.
+        changes: findings on changed rows; if a change explains the misfit, None is returned.
+        climb: function that selects models on the same rows with another loss.
+        weighing: loss settings of the selection.
     """
     reach = selection.nominal.cell.reach
     if changes and changes[-1].values["after"] < plausibility.FLOOR * reach:
@@ -301,7 +305,7 @@ def _findings(
 
 
 def _moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], settings: Settings) -> list[Finding]:
-    """Return a finding if separate stations explain the files far better than a common station."""
+    """Return the findings of a fit that do not depend on validation rows; `notes` are findings on its residuals."""
     blocks = [block for block in blocks if block.has_instrument]
     files = {block.file for block in blocks}
     stations = {block.station for block in blocks}

@@ -1,7 +1,7 @@
 """Tables of fitted parameters and residuals; frames are given as placements, not as changes from nominal.
 
-The fit moves a frame T by a step in its own axes, T · Trans(d) · Exp(w). In the table stand T's own position and
-rotation vector r, so that the covariance of (d, w) goes through  position = R d,  r' = J_r⁻¹(r) w.
+The fit moves a frame T by a step in its own axes, T · Trans(d) · Exp(w). The table contains the position and rotation
+vector r of T, so that the covariance of (d, w) is transformed by  position = R d,  r' = J_r⁻¹(r) w.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -75,7 +75,7 @@ def estimate_table(fit: GeometricFit, nominal: Installation) -> EstimateTable:
 
     Args:
         fit: the fit.
-        nominal: the nominal arm with its frames fitted; whose values stand in the column ``nominal``.
+        nominal: the nominal arm with fitted frames, whose values are written to the column ``nominal``.
     """
     parameters = layout(fit.cell)
     values = _values(fit.cell)
@@ -97,11 +97,11 @@ def read_covariance(folder: Path, cell: Installation) -> tuple[np.ndarray, np.nd
     """Read the covariance of a fit, for steps along its parameters (`calib.geometry.observation.step`).
 
     Returns:
-        Positions (f,) in the parameter vector, and the covariance (f, f).
+        Indices (f,) in the parameter vector, and the covariance (f, f).
 
     Raises:
-        RobotError: where the file is missing or damaged.
-        UsageError: where it belongs to another fit.
+        RobotError: if the file is missing or damaged.
+        UsageError: if the file belongs to another fit.
     """
     names, table = folders.read_covariance(folder)
     index = {name: k for k, name in enumerate(layout(cell).names)}
@@ -144,9 +144,11 @@ def _to_table(cell: Installation) -> np.ndarray:
 def residuals(outcome: Outcome) -> tuple[Iterator[Sequence[object]], list[str]]:
     """Return the residual (measured minus predicted) of every row: fitted, held out or validation; and the header.
 
-    Unseen rows have the columns of `INTERVAL` as well, as ``errors.csv`` of a session: ``sigma``, the standard
-    deviation that the fit expects of the calibrated arm's position error there, ``interval95`` within which 95 % of
-    such errors are to be, ``extrapolated`` 1 where a joint stands outside the training range.
+    Unseen rows also have the columns of `INTERVAL`, as in ``errors.csv`` of a session: ``sigma`` is the standard
+    deviation
+    of the calibrated arm's position error by the fit's error model, ``interval95`` the radius that contains 95 % of
+    such
+    errors, ``extrapolated`` is 1 if a joint is outside the training range.
     """
     sets = [("fit", outcome.fit)]
     for name, unseen in outcome.inputs.unseen.items():
@@ -164,7 +166,7 @@ def residuals(outcome: Outcome) -> tuple[Iterator[Sequence[object]], list[str]]:
 
 
 def _residual_rows(label: str, comparison: Comparison, outcome: Outcome) -> Iterator[Sequence[object]]:
-    """Yield the rows of one set in ``residuals.csv``."""
+    """Yield the rows of ``residuals.csv`` for one set of measurements."""
     nominal, calibrated = comparison.cells
     nominal_blocks = prepare(nominal, comparison.blocks)
     blocks = prepare(calibrated, comparison.blocks)
@@ -202,7 +204,9 @@ def _residual_rows(label: str, comparison: Comparison, outcome: Outcome) -> Iter
 
 
 def _nominal_sizes(nominal: Installation, block: Block, count: int) -> np.ndarray:
-    """Return the size (m,) of the nominal arm's residuals [mm]: positions where there are such, else the first part."""
+    """Return the size (m,) of the nominal arm's residuals [mm]: of positions if measured, else of the first
+    quantity.
+    """
     sizes = np.full(count, np.nan)
     for part in observe(nominal, block, NO_PARAMETERS):
         residual = part.per_row()
@@ -214,8 +218,11 @@ def _nominal_sizes(nominal: Installation, block: Block, count: int) -> np.ndarra
 def write_errors(path: Path, arm: Chain, validation: Mapping[str, Comparison]) -> None:
     """Write the errors of both arms at every validation row, and the error vectors of measured positions.
 
-    Then ``x y z`` is where the target was seen, ``to_nominal`` and ``to_calibrated`` lead from there to where each arm
-    puts it, all in the calibrated arm's base. After them `INTERVAL`, as in ``residuals.csv``.
+    For measured positions, ``x y z`` is the measured position of the target, and ``to_nominal`` and ``to_calibrated``
+    are
+    the vectors from it to the positions predicted by each arm, all in the calibrated arm's base. The columns of
+    `INTERVAL`
+    follow, as in ``residuals.csv``.
     """
     rows: list[list[object]] = []
     for name, comparison in validation.items():

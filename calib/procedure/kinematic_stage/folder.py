@@ -1,6 +1,7 @@
 """Folders of a fit and of its validation in a session: writing and reading their files.
 
-A fit's folder is written whole, beside its place, then moved there. Nothing else knows what its files are called.
+A fit's folder is written completely into a temporary folder, then moved to its final place. Only this module knows the
+names of its files.
 """
 
 import csv
@@ -85,7 +86,7 @@ class FitFolder:
 
     @property
     def tables(self) -> tuple[Path, Path]:
-        """The estimate, and its covariance."""
+        """Paths of the parameter estimate and of its covariance."""
         return self.path / ESTIMATE, self.path / COVARIANCE
 
     def metrics(self) -> FitMetrics:
@@ -93,7 +94,7 @@ class FitFolder:
         return _read(FitMetrics, self.numbers)
 
     def findings(self) -> Findings:
-        """Read the findings of the fit; schema 1 stores them in the report, without the loss."""
+        """Read the findings of the fit; folders of schema 1 store them in the report, without the loss."""
         metrics = self.metrics()
         if metrics.findings is not None:
             return metrics.findings
@@ -101,7 +102,9 @@ class FitFolder:
         return read_record(Findings, _current_form(early | {"notes": metrics.warnings}))
 
     def arms(self, inputs: Inputs, settings: Settings) -> Arms:
-        """Read the calibrated and the nominal arm; frames of the nominal arm are refitted to the fitted rows."""
+        """Return calibrated and nominal arm from the folder; frames of the nominal arm are refitted to the fitted
+        rows.
+        """
         findings = self.findings()
         calibrated_cell = installation.read(self.path)
         expected = None
@@ -184,14 +187,24 @@ def _current_form(findings: ParsedTable) -> ParsedTable:
 
 
 def check_fit_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Raise an error if a fit must not be written to `out`: the folder contains other results, or an input file."""
+    """Raise a UsageError if a fit must not be written to `out`: the folder contains other results, or an input file."""
     folders.check_target(out, OURS, (METRICS, calibrated.ROBOT, RESIDUALS), "fit", inputs)
 
 
 def write_folder(
     outcome: Outcome, out: Path, plots: Callable[[Outcome, Path], None] | None = None, *, owned: bool = False
 ) -> Path:
-    """Write all files of a fit, or none on failure; an `owned` folder is not checked for foreign files."""
+    """Write all files of a fit to the folder `out`, or none on failure, and return its path.
+
+    Args:
+        outcome: the fit.
+        out: path of the folder.
+        plots: writes figures into the folder; None: no figures.
+        owned: whether the procedure owns the folder, so that it is not checked for foreign files.
+
+    Raises:
+        UsageError: if a folder that is not owned contains other results, or an input file.
+    """
     if not owned:
         check_fit_target(out, [outcome.inputs.source])
 

@@ -50,7 +50,7 @@ def reprojection(cell: Installation, blocks: Sequence[PoseMeasurements]) -> floa
 
 
 def _rms(residuals: np.ndarray) -> float:
-    """Return the rms distance of residuals (2, k)."""
+    """Return the rms distance of residuals (2, k) [px]."""
     return float(np.sqrt(np.mean(np.sum(residuals**2, axis=0))))
 
 

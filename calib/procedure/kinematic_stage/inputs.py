@@ -40,10 +40,10 @@ class Unseen:
     """Validation rows: measurements that are not fitted.
 
     Attributes:
-        block: the measurements; station and tool names are those of the fit unless ``own_frames``.
-        own_frames: True where base and tool placement are to be fitted on these rows.
-        held_out: True for a share of a fit file, False for a validation file.
-        seen: True if the same file was fitted, so that its errors are no evidence.
+        block: the measurements; station and tool names are those of the fit unless `own_frames`.
+        own_frames: whether base and tool placement are to be fitted on these rows.
+        held_out: True for a held-out share of a fit file, False for a validation file.
+        seen: whether the same file was fitted, so that its errors are no evidence.
     """
 
     block: PoseMeasurements
@@ -58,12 +58,12 @@ class Inputs:
 
     Attributes:
         chain: the nominal arm.
-        source: the file it came from.
-        fit: blocks to fit on.
-        unseen: by the name of the file they come from.
+        source: file that the robot was read from.
+        fit: blocks to fit.
+        unseen: name of a validation file -> its rows.
         notes: remarks for the user on the interpretation of the files.
-        earlier: the robot as its file has it, with what an earlier fit left there; None for a URDF.
-        masses: (n, 10) identified standard parameters that gravity torques are computed from; None: the arm's own.
+        earlier: the robot with the results of an earlier fit, as its file contains them; None for a URDF.
+        masses: (n, 10) identified standard parameters for gravity torques; None: those of the arm's description.
     """
 
     chain: Chain
@@ -90,7 +90,7 @@ class Inputs:
 
     @property
     def bare(self) -> Chain | None:
-        """Geometry of the robot as it came that is valid without its corrections; None if it has none."""
+        """Geometry that the robot of an earlier fit has if used without its joint corrections; None if it has none."""
         if self.earlier is None or self.earlier.corrections is None:
             return None
         return self.earlier.chain
@@ -117,11 +117,15 @@ def gather(
 
     Args:
         robot: see `calib.robot.library`; or a robot in memory.
-        measured: files, or blocks in memory, to fit on.
-        validate: the same, to validate on.
-        options: how files are read.
-        settings: stations, tools, rows to hold out, seed of their choice.
-        base, tip: links of a URDF.
+        measured: files, or blocks in memory, to fit.
+        validate: files, or blocks in memory, to validate on.
+        options: options for reading the files; None: defaults.
+        settings: stations, tools, rows to hold out, seed of their choice; None: defaults.
+        base, tip: links of a URDF; None: see `calib.robot.library`.
+
+    Raises:
+        UsageError: without a measurement file.
+        MeasurementError: for a file that cannot be read.
     """
     options = options or FitOptions()
     settings = settings or FitSettings()
@@ -175,13 +179,13 @@ def gather(
 def with_unseen(
     inputs: Inputs, validate: Sequence[Path | PoseMeasurements], options: FitOptions, settings: FitSettings
 ) -> Inputs:
-    """Return the inputs with further validation rows; copies of fitted rows are marked as seen.
+    """Return the inputs with additional validation rows; copies of fitted rows are marked as seen.
 
     Args:
         inputs: robot, fitted rows, and unseen rows so far.
         validate: files, or blocks in memory.
-        options: how files are read.
-        settings: whether they have frames of their own.
+        options: options for reading the files.
+        settings: whether the validation rows have frames of their own.
     """
     unseen = dict(inputs.unseen)
     notes: list[str] = []
@@ -207,10 +211,10 @@ def with_unseen(
 
 
 def plain_reference(nominal: Installation, inputs: Inputs) -> Installation | None:
-    """Return the arm by plain least squares, without joint corrections; None where the rows are too few for it.
+    """Return the arm fitted by plain least squares, without joint corrections; None if there are too few rows.
 
     Args:
-        nominal: the arm as it was, placed.
+        nominal: the arm before the fit, with base and tool placed.
         inputs: the rows to fit.
     """
     bare = inputs.bare
@@ -255,8 +259,9 @@ def load_rigid(
 ) -> tuple[CalibratedChain, Path]:
     """Return the robot whose chain dynamics and motion planning use, and its file.
 
-    That chain is the best one without joint corrections: neither torques nor a robot's controller know of these, and
-    the geometry they belong to is worse than this one where they are left out.
+    Its chain is the best geometry without joint corrections, since neither torque models nor controllers apply
+    corrections,
+    and the geometry fitted together with corrections is less accurate without them.
     """
     if isinstance(robot, CalibratedChain):
         return robot, Path(robot.source or robot.chain.name)
@@ -289,10 +294,10 @@ def read_file(
     """Read the measurements of a file (or folder of images) for a chain, and check them against its joint limits.
 
     Args:
-        source: the file, or a block in memory, which is checked alike.
+        source: the file, or a block in memory, which is checked in the same way.
         chain: the arm.
-        options: how it is read.
-        like: blocks read before; images of the same size are taken to be by the same camera.
+        options: options for reading the file.
+        like: blocks read before; images of the same size are assumed to come from the same camera.
     """
     path = _path(source)
     joints = joints_of(chain)
@@ -343,8 +348,9 @@ def _path(source: Path | PoseMeasurements) -> Path:
 def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeasurements, PoseMeasurements | None]:
     """Return the rows of a block to fit, and the held-out rows (None for a share of 0).
 
-    Poses are permuted, not rows: the reflectors of one pose stay together, and so do the two rows of a distance and the
-    cycles of a repeated pose.
+    Poses are drawn, not rows, so that the reflectors of one pose, the two rows of a distance and the cycles of a
+    repeated
+    pose stay together.
     """
     if share == 0.0:
         return block, None
@@ -383,7 +389,7 @@ def _with_station_and_tool_names(
 ) -> list[PoseMeasurements]:
     """Return the blocks to fit with station and tool names from --stations and --tools; all names are distinct.
 
-    Where an arm carried a camera and something else, or two cameras, these are several tools whatever --tools says.
+    If an arm carried a camera and another target, or two cameras, these are several tools whatever --tools says.
     """
     carried = list(dict.fromkeys(block.carried for _, block in read_blocks))
     station_of: dict[Path, str] = {}
@@ -415,7 +421,7 @@ def _with_station_and_tool_names(
 
 
 def _carried_name(device: tuple[str, object], carried: Sequence[tuple[str, object]]) -> str:
-    """Return the name of a file's tool, with a number from the second tool of its kind on."""
+    """Return the name of a file's tool: its kind, with a number if it is not the first tool of this kind."""
     kind = device[0]
     of_kind = [candidate for candidate in carried if candidate[0] == kind]
     number = of_kind.index(device) + 1
@@ -437,7 +443,7 @@ def _free_name(unseen: Mapping[str, Unseen], file: str) -> str:
 
 
 def _with_frames_of_fit(block: PoseMeasurements, fit: Sequence[PoseMeasurements], notes: list[str]) -> PoseMeasurements:
-    """Return a validation block that uses the station and the tools of the fit; adds to the notes."""
+    """Return a validation block with the names of the fit's station and tools; appends remarks to `notes`."""
     fit = [fitted for fitted in fit if fitted.carried == block.carried] or fit
     if block.has_instrument:
         stations = [fitted.station for fitted in fit if fitted.has_instrument]

@@ -18,7 +18,9 @@ SCHEMA = 3
 
 @dataclass(frozen=True)
 class PoseIntervalCoverage:
-    """Share of errors within the fit's 95 % interval, interval width, and number of rows that extrapolate."""
+    """Share of errors within the fit's 95 % interval, median and rms width [mm], and number of rows that
+    extrapolate.
+    """
 
     coverage_percent: float
     median_mm: float
@@ -33,19 +35,20 @@ class ComparedRows:
     """Errors of both arms on one set of rows.
 
     Attributes:
-        poses: how many robot poses.
-        frames: whose base and tool placement was used, in words.
-        nominal, calibrated: their errors.
-        urdf_alone: those of the calibrated geometry without joint corrections.
-        plain: those of plain least squares, the reference; None on the fit's own rows.
+        poses: number of robot poses.
+        frames: text on the source of the base and tool placement.
+        nominal, calibrated: errors of the nominal and the calibrated arm.
+        urdf_alone: errors of the calibrated geometry without joint corrections; None without corrections.
         pair_distance_mm: arm → errors of the distances between pairs of positions.
-        iso9283: of repeated poses.
-        unseen: False where rows are none that the fit had not seen.
-        parameters: how many were fitted, on the fit's own rows.
-        interval95: how the errors that the fit stated held here.
-        reprojection_px: arm -> rms distance of seen from predicted corners.
-        position_means: what the errors ``position_mm`` are: ``position`` where positions were measured, else what
-            sockets and planes show of them (`calib.geometry.accuracy`).
+        iso9283: repeatability and accuracy from repeated poses; None without such poses.
+        unseen: False if the fit had seen the rows.
+        parameters: number of parameters fitted to these rows; 0 on unseen rows.
+        interval95: coverage of the error intervals that the fit predicts; None without an error model.
+        reprojection_px: arm -> rms distance between detected and predicted corners.
+        plain: errors of the plain reference; None on the fit's own rows.
+        position_means: meaning of the errors ``position_mm``: ``position`` if positions were measured, else the
+            component
+            that sockets and planes measure (`calib.geometry.accuracy`).
     """
 
     poses: int
@@ -63,13 +66,13 @@ class ComparedRows:
     position_means: str = "position"
 
     def words(self, nature: str) -> str:
-        """Return the name of an error (position, orientation, distance) by what was measured."""
+        """Return the name of an error (position, orientation, distance), depending on what was measured."""
         if nature == "position":
             return self.position_means
         return nature
 
     def judged(self, deliverable: str) -> ArmErrors:
-        """Return the errors of the deliverable (robot file) on which the verdict is based."""
+        """Return the errors on which the verdict on a deliverable (``urdf`` or ``corrections``) is based."""
         if deliverable == "urdf" and self.urdf_alone is not None:
             return self.urdf_alone
         return self.calibrated
@@ -104,17 +107,17 @@ class Findings:
     """Findings of a fit that the verdict needs in addition to the errors on rows; stored in the fit's folder.
 
     Attributes:
-        model: the one chosen.
-        cross_validated, nominal_cross_validated: errors of the chosen model and of the nominal arm [m]; None where they
-            were not computed.
-        outlier_share: of the fit's rows.
-        reach: of the arm [m].
-        loss: that was used; empty where it is not known.
-        noticed: findings on the fit, worst first, whatever the unseen rows are.
-        blind: stations cross-validated by regions only, since their tool is not identifiable from the others.
-        rigid_cross_validated: the error of the best model without joint corrections [m].
-        joint_range: in which the fit was made; None in files of earlier versions.
-        discrepancy: what makes an error at a pose likely, learnt by cross-validation; None where nothing was.
+        model: the chosen model.
+        cross_validated, nominal_cross_validated: errors of the chosen model and of the nominal arm [m]; None if not
+            computed.
+        outlier_share: share of outliers among the fitted rows.
+        reach: reach of the arm [m].
+        loss: loss function that was used; empty if unknown.
+        noticed: findings on the fit, worst first; they do not depend on unseen rows.
+        blind: stations cross-validated by regions only, since their tool is not identifiable from the other stations.
+        discrepancy: distribution of the error at a pose, estimated by cross-validation; None if not estimated.
+        rigid_cross_validated: error of the best model without joint corrections [m]; None if not computed.
+        joint_range: joint range of the fitted rows; None in files of earlier versions.
     """
 
     model: str
@@ -135,10 +138,13 @@ class ValidationMetrics:
     """Results of a fit on validation rows: errors, verdict, warnings.
 
     Attributes:
-        deliverables: the verdict on each existing one of `calib.procedure.kinematic_stage.settings.DELIVERABLES`.
-        deliverable: which of them `verdict` and `reason` are about; empty in files of earlier versions.
-        noticed: the findings of the warnings; remarks from reading the files are text only.
+        validation: name of a validation file -> errors of both arms.
+        verdict, reason: level of the verdict, and its reason as text.
+        warnings: texts for the user.
+        noticed: the findings that the warnings render; remarks from reading the files are text only.
         code, advice: of the finding that decided the verdict; empty for a pass.
+        deliverables: verdict on each existing deliverable of `calib.procedure.kinematic_stage.settings.DELIVERABLES`.
+        deliverable: name of the deliverable that `verdict` and `reason` are about; empty in files of earlier versions.
     """
 
     validation: Mapping[str, ComparedRows]
@@ -169,7 +175,7 @@ class FitMetrics(ValidationMetrics):
 
     @property
     def proofs(self) -> dict[str, ComparedRows]:
-        """Errors on each set of validation rows, by name."""
+        """Errors on each set of validation rows that the fit had not seen, by name."""
         return {name: rows for name, rows in self.validation.items() if rows.unseen}
 
 
@@ -180,8 +186,8 @@ class ImageCoverage:
     Attributes:
         file: the images' folder.
         size: width and height of the images [px].
-        count: corners per cell of the image, row by row.
-        rms: distance of corners seen from corners predicted [px], per cell; 0 where none was seen.
+        count: number of corners per cell of the image, row by row.
+        rms: rms distance between detected and predicted corners [px] per cell; 0 in cells without corners.
     """
 
     file: str

@@ -1,6 +1,6 @@
-"""Findings on measurements that contradict this arm (catalogue, chapter 1): wrong columns, scale, large changes.
+"""Findings on measurements that contradict the arm (catalogue, chapter 1): wrong columns, scale, large changes.
 
-Rows that do not fit, and whether rigid geometry explains the measurements.
+Also: rows with large residuals, and whether rigid geometry explains the measurements.
 """
 
 from collections.abc import Sequence
@@ -53,13 +53,14 @@ def named_outliers(fit: GeometricFit) -> list[Outlier]:
 def misfit(selection: ModelSelection, reach: float) -> Finding | None:
     """Return a finding if no rigid geometry explains the measurements: the error exceeds `FLOOR` of the reach.
 
-    Both on the fitted rows, degrees of freedom counted, and cross-validated: few poses predict each other badly under
-    any model, which says nothing against this one. Where the chosen model, joint corrections included, leaves less than
-    `FLOOR`, it is a note.
+    The error must exceed this limit both on the fitted rows, corrected for degrees of freedom, and in cross-validation,
+    since few poses predict each other badly under any model. If the error of the chosen model, joint corrections
+    included,
+    is below `FLOOR`, the finding is a note. None if a rigid geometry explains the measurements.
 
     Args:
-        selection: of models by cross-validation.
-        reach: of the arm [m].
+        selection: the selection of models by cross-validation.
+        reach: reach of the arm [m].
     """
     rigid = next((rung for rung in selection.rungs if rung.model == "geometry"), None)
     if rigid is None:
@@ -76,9 +77,9 @@ def gross_rows(selection: ModelSelection, robust: ModelSelection, reach: float) 
     """Return a finding if a few grossly wrong rows cause the error that `misfit` reports; otherwise None.
 
     Args:
-        selection: of models with a loss that heeds every row.
-        robust: the rigid models on the same rows with a loss that does not.
-        reach: of the arm [m].
+        selection: models fitted with a loss that weighs every row.
+        robust: the rigid models fitted to the same rows with a robust loss.
+        reach: reach of the arm [m].
     """
     gross = [outlier for outlier in named_outliers(robust.rigid) if outlier.sigmas > MAX_RESIDUAL]
     if not gross or misfit(robust, reach):
@@ -106,11 +107,11 @@ def _position_rms(fit: GeometricFit) -> float:
 
 
 def of_range(measured_range: JointRange, tolerance: float | None) -> list[Finding]:
-    """Return findings on the joint range that a calibration is about, and on what it promises outside.
+    """Return findings on the joint range in which a calibration is valid, and on the predicted error outside.
 
     Args:
         measured_range: the measured range, and σ over the whole range.
-        tolerance: largest rms on unseen poses that is good enough [m]; None where none was given.
+        tolerance: largest acceptable rms on unseen poses [m]; None if not stated.
     """
     sigma, nominal = measured_range.sigma, measured_range.nominal
     if sigma is None or not measured_range.moved:
@@ -150,11 +151,11 @@ def findings(
     """Return findings on measurements that contradict the arm, the most likely cause first.
 
     Args:
-        nominal: the arm as it was, placed.
-        fit: of the calibrated one.
+        nominal: the arm before the fit, with base and tool placed.
+        fit: fit of the calibrated arm.
         blocks: the rows.
-        cross_validated: error of the chosen model [m]; None where it was not computed.
-        reach: of the arm [m].
+        cross_validated: error of the chosen model [m]; None if not computed.
+        reach: reach of the arm [m].
     """
     before = errors(nominal, blocks).rms
     after = errors(fit.cell, blocks).rms
@@ -195,7 +196,7 @@ def _as_positions(block: PoseMeasurements) -> PoseMeasurements:
 def _wrong_columns(
     nominal: Installation, blocks: Sequence[PoseMeasurements], before: float, reach: float
 ) -> list[Finding]:
-    """Return a finding if the nominal arm explains the rows once columns or rows are changed."""
+    """Return a finding if the nominal arm explains the rows after a change of columns or rows; else []."""
     if not before > FLOOR * reach:
         return []
     mirrored = before > limit("unexplained", "share") * reach
@@ -203,7 +204,9 @@ def _wrong_columns(
 
 
 def _misread(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> list[Finding]:
-    """Return a finding if the angles of orientations fit by another convention, and not as stated."""
+    """Return a finding if the angles of the orientations fit by another convention, but not by the stated one; else
+    [].
+    """
     angle = errors(nominal, blocks).orientation
     if angle is None or not np.sqrt(np.mean(angle**2)) > limit("orientations-off", "angle"):
         return []
@@ -211,7 +214,7 @@ def _misread(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> list[
 
 
 def _explanation(change: Explanation | None, nominal: Installation) -> list[Finding]:
-    """Return the finding on a change that explains the rows, if it is serious enough."""
+    """Return the finding on a change that explains the rows if it reaches a level of the catalogue; else []."""
     if change is None:
         return []
     before = float(np.sqrt(change.before[0]))
@@ -243,7 +246,7 @@ def _large_changes(fit: GeometricFit, reach: float) -> list[Finding]:
 
 
 def _wrong_scale(codes: tuple[str, str], scale: Scale | None) -> list[Finding]:
-    """Return the finding on an implausible scale factor, the first of two that is serious enough to report."""
+    """Return the finding on an implausible scale factor: of two codes, the first that reaches a level; else []."""
     if scale is None:
         return []
     off = abs(scale.factor - 1.0)

@@ -1,4 +1,4 @@
-"""Selection of the poses to measure: the package `poses` gets a robot's observation Jacobian."""
+"""Selection of the poses to measure: passes a robot's observation Jacobian to the package `poses`."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ class PoseOutlook:
     """Predicted accuracy of a calibration with the chosen poses, before measuring.
 
     Attributes:
-        poses: of the fit on the chosen poses.
-        others: of other numbers of poses, chosen greedily.
-        blind: index and prediction without line-of-sight constraints; None if there are none.
-        comparable: index of poses chosen in the same way as `blind`, with line of sight.
+        poses: prediction for a fit on the chosen poses.
+        others: predictions for other numbers of poses, chosen greedily.
+        blind: index and prediction without line-of-sight constraints; None if there are no such constraints.
+        comparable: index of poses chosen in the same way as `blind`, with line-of-sight constraints.
     """
 
     poses: Prediction
@@ -72,13 +72,14 @@ class Chosen:
     Attributes:
         chain: the nominal arm.
         selection: see `calib.poses.select`.
-        parameters: how many are identifiable from the measurements.
-        existing: index of the existing poses alone; None without them, or if they are too few.
+        parameters: number of parameters that are identifiable from the measurements.
+        existing: index of the existing poses alone; None without existing poses, or if they are too few.
         checked, unchecked: constraints that were checked, and those that could not be, as text.
         notes: other remarks for the user.
         outlook: predicted accuracy with these poses and with others.
-        by_images: whether the poses are those at which a camera sees its board.
-        run, driven: the poses' order, in which `selection.q` is, and the ways between them; how they are driven.
+        run: order of the poses, which is that of `selection.q`, and the paths between them.
+        driven: speed and dwell time of the run.
+        by_images: whether a camera measures by images of a board.
     """
 
     chain: Chain
@@ -110,7 +111,7 @@ class Chosen:
         return FIGURES[:1]
 
     def kept(self) -> list[str]:
-        """Return lines on the checked constraints, on the constraints not checked, and on the run."""
+        """Return text lines on the constraints that were checked, on those not checked, and on the run."""
         lines = []
         if self.checked:
             lines.append(f"kept: {', '.join(self.checked)}")
@@ -135,13 +136,16 @@ def choose(
 
     Args:
         robot: see `calib.robot.library`.
-        m: how many.
-        settings: what is measured, index, method, seed.
-        constraints: see `calib.procedure.measuring.constraints_file`; a file, or its tables.
-        existing: poses measured before, which count: a CSV, or in memory.
-        base, tip: links of a URDF.
-        map: where parallel work runs (`calib.workers`).
-        progress: called with (done, total, what).
+        m: number of poses.
+        settings: quantity to measure, index, method, seed.
+        constraints: constraints file, or its tables, see `calib.procedure.measuring.constraints_file`; None: defaults.
+        existing: poses measured before, which the selection complements: a CSV, or in memory; None: none.
+        base, tip: links of a URDF; None: see `calib.robot.library`.
+        map: function that runs parallel work (`calib.workers`).
+        progress: called with (done, total, text); None: silent.
+
+    Raises:
+        UsageError: for wrong settings or constraints, and if too few poses are feasible.
     """
     require(m >= 1, f"-m {m}: give a number of poses, 1 or more", UsageError)
     existing_file = existing if isinstance(existing, Path) else None
@@ -285,7 +289,9 @@ def _draw_feasible(space: SearchSpace, limits: Limits, settings: SelectionSettin
 def _outlook(
     jacobian: Observation, limits: Limits, search: SearchSettings, q: np.ndarray, exchange: Exchange, comparable: float
 ) -> PoseOutlook:
-    """Return the predicted accuracy with chosen poses q (m, n), with other pose counts, and without sight limits."""
+    """Return the predicted accuracy with chosen poses q (m, n), with other pose counts, and without sight
+    constraints.
+    """
     space = limits.space(jacobian, sight=False)
     existing = exchange.before
     stream = np.random.default_rng([search.seed, 2])
@@ -336,7 +342,7 @@ def write(chosen: Chosen, path: Path) -> Path:
 
 
 def bound_words(selection: Selection) -> str:
-    """Return a text on the poses for which the bound of an efficiency holds, and on the bound's accuracy."""
+    """Return a text on the set of poses to which the bound of an efficiency refers, and on the bound's accuracy."""
     ceiling = selection.ceiling
     if ceiling.climbs:
         percent = 100 * ceiling.gap

@@ -45,7 +45,9 @@ ARM = {"urdf": "calibrated", "corrections": "with joint corrections"}
 
 @dataclass(frozen=True)
 class _Proof:
-    """Errors on which the verdict on the arms is based: rms before and after [m], and the rows of these errors."""
+    """Errors on which the verdict on the arms is based: rms of nominal and calibrated arm [m], and the rows of the
+    errors.
+    """
 
     before: float
     after: float
@@ -70,30 +72,32 @@ def judge(
 ) -> Verdict:
     """Return the verdict on a calibration from its validation rows; without such rows, from cross-validation.
 
-    Rules, the first group that says something; inside a group the worst finding decides:
+    The first group of rules that yields a finding decides; inside a group, the worst finding decides:
 
     1. ``placed-elsewhere``, ``far-off``; ``orientations-off``; ``above-tolerance``;
-    2. where only frames were asked for: the tolerance, or ``frames-only`` (not judged) without one;
-    3. the calibrated arm is as good as the nominal one (within `MIN_GAIN`). ``nothing-to-gain`` (pass) where what
-       remains is below `FLOOR` of the reach, ``transfer-untested`` where stations could not be left out as a whole,
-       else ``no-better-model``. A pass, too, where the nominal arm leaves less than any instrument (`TOO_GOOD`);
-    4. ``worse-than-nominal``; by cross-validation alone, where both leave less than `FLOOR` of the reach,
-       ``keep-nominal``, since the nominal arm may have been fitted to these very rows;
+    2. if only frames were requested: the tolerance, or ``frames-only`` (not judged) without a tolerance;
+    3. if the calibrated arm is as good as the nominal one (within `MIN_GAIN`): ``nothing-to-gain`` (pass) if the error
+    is
+       below `FLOOR` of the reach, ``transfer-untested`` if no station could be held out as a whole, else
+       ``no-better-model``; also a pass if the nominal arm's error is smaller than any instrument's (`TOO_GOOD`);
+    4. ``worse-than-nominal``; from cross-validation only, if both errors are below `FLOOR` of the reach,
+       ``keep-nominal``, since the nominal arm may have been fitted to these rows;
     5. ``no-unseen-poses``;
     6. ``rigid-misfit`` or ``gross-rows`` of the fit, ``refuted``, ``no-transfer``, ``intervals-too-narrow``,
-       ``small-gain``, ``many-outliers``; none of them: pass.
+       ``small-gain``, ``many-outliers``; without any of them: pass.
 
     The fit's other findings, those of `calib.procedure.kinematic_stage.plausibility`, and ``gross-unseen-rows`` count
-    in every group; with the latter there is no ``refuted``.
+    in
+    every group; ``gross-unseen-rows`` replaces ``refuted``.
 
     Args:
-        fit: both arms on the fit's rows.
-        validation: both arms on other rows.
+        fit: errors of both arms on the fitted rows.
+        validation: name of a validation file -> errors of both arms.
         findings: warnings and notes on the fit.
         requested_model: the model that the settings name, or auto.
-        tolerance: largest rms on unseen poses that is good enough [m]; None where none was given.
-        cross_validated: error of what is judged on held-out rows [m]; None where it was not computed.
-        arm: what is judged, in a word or two, where there are several deliverables.
+        tolerance: largest acceptable rms on unseen poses [m]; None if not stated.
+        cross_validated: cross-validated error of the deliverable [m]; None if not computed.
+        arm: name of the deliverable if there are several; else empty.
     """
     unseen = {name: comparison for name, comparison in validation.items() if comparison.proves}
     nominal_rms = fit.errors[0].rms
@@ -149,7 +153,9 @@ def judge(
 
 
 def _frames_verdict(worst: _Proof, tolerance: float | None, arm: str, findings: Sequence[Finding]) -> Verdict:
-    """Return the verdict where only frames were fitted and the arm errs within the tolerance, if there is one."""
+    """Return the verdict if only frames were fitted: pass within a tolerance, not judged without one, or by
+    findings.
+    """
     if tolerance is not None:
         return Verdict.of(_figures(worst, arm, tolerance), findings)
     verdict = Verdict.of(sentence(finding("frames-only", rms=worst.after, where=worst.where)), findings)
@@ -159,7 +165,7 @@ def _frames_verdict(worst: _Proof, tolerance: float | None, arm: str, findings: 
 
 
 def _figures(worst: _Proof, arm: str, tolerance: float | None = None) -> str:
-    """Return the sentence on the errors before and after that a verdict is based on."""
+    """Return the sentence with the nominal and the calibrated arm's error that a verdict is based on."""
     figures = finding("errors", after=worst.after, before=worst.before, where=worst.where, arm=arm, tolerance=tolerance)
     return sentence(figures)
 
@@ -167,9 +173,9 @@ def _figures(worst: _Proof, arm: str, tolerance: float | None = None) -> str:
 def _far_off(
     proofs: Sequence[_Proof], sets: Mapping[str, Comparison], tolerance: float | None, reach: float
 ) -> Iterator[Finding]:
-    """Yield findings on files where both arms are far off (moved instrument or another robot), or above the tolerance.
+    """Yield findings on large errors: of both arms (moved instrument or another robot), or above the tolerance.
 
-    Orientations that are off, of all sets of rows, and errors above the tolerance.
+    The errors are those of positions in `proofs`, and of orientations in all sets of rows.
     """
     for proof in proofs:
         if proof.rows is not None:
@@ -187,7 +193,9 @@ def _far_off(
 
 
 def _gross(proof: _Proof, reach: float) -> Iterator[Finding]:
-    """Yield the finding that rows far off for both arms alike, probably measured wrongly, make most of the error."""
+    """Yield the finding that rows with large errors of both arms, probably wrong measurements, cause most of the
+    error.
+    """
     if proof.rows is None:
         return
     before = proof.rows.errors[0].main
@@ -206,7 +214,7 @@ def _far_above_median(sizes: np.ndarray) -> np.ndarray:
 
 
 def _row_texts(comparison: Comparison, selected: np.ndarray) -> list[str]:
-    """Return number and error of the selected rows (m,); none where errors are not of single rows."""
+    """Return number and error of the selected rows (m,) as text; [] if errors do not belong to single rows."""
     numbers = [int(row) for block in comparison.blocks for row in block.rows]
     sizes = comparison.errors[1].main
     if len(numbers) != len(selected):
@@ -215,7 +223,9 @@ def _row_texts(comparison: Comparison, selected: np.ndarray) -> list[str]:
 
 
 def _nothing_gained(proofs: Sequence[_Proof], findings: Findings) -> list[Finding]:
-    """Return a finding where the calibrated arm is as good as the nominal one: nothing to gain, or no model helps."""
+    """Return a finding if the calibrated arm is as good as the nominal one: nothing to gain, or no better model; else
+    [].
+    """
     if not proofs:
         return []
     proof = max(proofs, key=attrgetter("before"))
@@ -233,7 +243,7 @@ def _nothing_gained(proofs: Sequence[_Proof], findings: Findings) -> list[Findin
 
 
 def _worse(proofs: Sequence[_Proof], reach: float) -> list[Finding]:
-    """Return findings where the calibrated arm is worse than the nominal one."""
+    """Return findings if the calibrated arm is worse than the nominal one; else []."""
     rules = [finding("worse-than-nominal", times=proof.ratio) for proof in proofs]
     worse = list(filter(level_of, rules))
     if worse and proofs[0].rows is None and proofs[0].after <= FLOOR * reach < np.inf:
@@ -281,7 +291,7 @@ def _doubts(
 class Arms:
     """Nominal and calibrated installation (frames fitted to the fitted rows), and the best rigid geometry.
 
-    With the error model of the calibrated one, and the plain reference, where there are such.
+    `expected` is the error model of the calibrated arm, `plain` the plain reference; None if not available.
     """
 
     nominal: Installation
@@ -296,13 +306,13 @@ class Assessment:
     """Errors of both arms on the same rows, and the verdict.
 
     Attributes:
-        fit: on the fit's rows.
-        validation: on unseen rows, by file name.
-        verdict: on what is to be delivered, with its reason.
+        fit: errors on the fitted rows.
+        validation: name of a validation file -> errors on its rows.
+        verdict: verdict on the requested deliverable, with its reason.
         noticed: findings on the fit and on the unseen rows, worst first.
-        notes: what the reading of the files noticed, as text.
-        deliverables: the verdict on each deliverable that there is (`DELIVERABLES`).
-        deliverable: which of them `verdict` is about.
+        notes: remarks from reading the files, as text.
+        deliverables: verdict on each existing deliverable (`DELIVERABLES`).
+        deliverable: name of the deliverable that `verdict` is about.
     """
 
     fit: Comparison
@@ -339,10 +349,10 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, weighing: Settings, s
     """Return the errors of both arms on fitted and validation rows, and the verdict.
 
     Args:
-        arms: what is compared.
+        arms: the arms to compare.
         inputs: the rows.
         findings: warnings and notes on the fit.
-        weighing: of the fit, as asked for; the loss is the one that the fit chose.
+        weighing: requested loss settings; the loss that the fit chose replaces the requested one.
         settings: the requested model, tolerance, deliverable, and the seed of the pairs whose distances are compared.
     """
     weighing = replace(weighing, loss=findings.loss or weighing.loss)
@@ -393,7 +403,7 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, weighing: Settings, s
 
 
 def _references(name: str, rows: Comparison, deliverable: str, frames_only: bool) -> Iterator[Finding]:
-    """Yield the nominal arm's, the plain fit's and the delivered arm's error on validation rows, and what is worse."""
+    """Yield findings on validation rows: errors of nominal arm, plain reference and deliverable, and if it is worse."""
     if rows.plain is None or not rows.proves:
         return
     delivered = rows.errors[1].rms
@@ -460,9 +470,11 @@ def _copies(inputs: Inputs) -> list[str]:
 def _noticed(name: str, rows: Comparison, usual: float) -> Iterator[Finding]:
     """Yield the findings on one set of validation rows: moved instrument, doubtful rows, frames, intervals.
 
-    Errors that look like another placement of the instrument than the `usual` nominal ones [m], rows that may be wrong
-    measurements, a placement of base and tool that did not settle or took up most of the errors, and how many errors
-    are within the 95 % interval.
+    They concern errors of the nominal arm far above its `usual` error [m] (the instrument may have moved), rows that
+    may be
+    wrong measurements, a placement of base and tool that did not converge or absorbed most of the errors, and the share
+    of
+    errors within the 95 % interval.
     """
     before = rows.errors[0].main
     sizes = rows.errors[1].main

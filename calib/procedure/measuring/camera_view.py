@@ -56,15 +56,15 @@ FREE_LENS_PARAMETERS = 8
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """Constraint "the camera sees the whole board": q (m, n) -> (m, 19), satisfied where <= 0.
+    """Constraint "the camera sees the whole board": callable, q (m, n) -> (m, 19), satisfied where <= 0.
 
     Attributes:
-        cell: the arm with camera and board where they roughly are.
-        board: to be seen whole.
-        mounting: ``in hand`` or ``to hand``.
-        tilt: largest angle [rad].
-        span: least and largest distance [m].
-        margin: to the image's edge [px].
+        cell: the arm with approximate placements of camera and board.
+        board: the board.
+        mounting: ``in hand`` (the arm carries the camera) or ``to hand`` (the arm carries the board).
+        tilt: largest angle between the line of sight and the board's normal [rad].
+        span: least and largest distance of the board's centre [m].
+        margin: least distance of the board from the image's edge [px].
     """
 
     cell: Installation
@@ -122,7 +122,7 @@ class CameraView:
 
     @property
     def assumed(self) -> str:
-        """The noise assumed when σ is predicted, as a sentence."""
+        """Sentence on the measurement noise that is assumed to predict σ."""
         return ASSUMED
 
     def observation(self, lower: np.ndarray, upper: np.ndarray, seed: int = 0) -> ImageObservation:
@@ -142,7 +142,7 @@ class CameraView:
         return ImageObservation(self.cell, True, columns[split.kept], view=self)
 
     def block(self, q: np.ndarray) -> list[Block]:
-        """Return a block of images at joint values q (m, n), ready for a fit, with all corners set to zero."""
+        """Return blocks of images at joint values q (m, n), ready for a fit, with all corner pixels set to zero."""
         pixel = np.zeros((len(q), len(corners(self.board)), 2))
         block = Pixels(
             q,
@@ -164,9 +164,16 @@ class CameraView:
         upper: np.ndarray,
         seed: int | np.random.Generator,
     ) -> np.ndarray:
-        """Return up to `count` random postures (·, n) with the board in view: views are drawn, and the arm put there.
+        """Return up to `count` random postures (·, n) with the board in view.
 
-        Postures drawn at random see a board once in a thousand.
+        Views are drawn, and joint values are solved for them, since only one in a thousand random postures sees the
+        board.
+
+        Args:
+            count: number of postures.
+            feasible: function q (m, n) -> (m,) whether each posture is feasible.
+            lower, upper: (n,) joint limits [rad or m].
+            seed: seed or generator of random numbers.
         """
         stream = np.random.default_rng(seed)
         goal = Goal(self.cell, 6, lower, upper)
@@ -205,8 +212,9 @@ class CameraView:
 class ImageObservation(Observation):
     """Whitened observation Jacobian of images for the p identifiable parameters: q (m, n) -> (m, rows, p).
 
-    An image's corners are reduced to what they say of the board's pose and the lens; noise of corners and of the arm's
-    repeatability are our choice (`CORNER`, `DISPLACEMENT`, `TURN`).
+    An image's corners are condensed to the information on the board's pose and the lens; the noise of corners and of
+    the
+    arm's repeatability is our choice (`CORNER`, `DISPLACEMENT`, `TURN`).
 
     Attributes:
         view: camera and board.
@@ -233,13 +241,13 @@ def camera_view(table: CameraTable, chain: Chain, where: str, folder: Path) -> C
     """Return the camera view described by a constraints file.
 
     Args:
-        table: its table [camera].
+        table: table [camera] of the file.
         chain: the nominal arm.
-        where: for messages.
-        folder: that the lens's and the board's files are beside.
+        where: name of the file for messages.
+        folder: folder that contains the lens's and the board's files.
 
     Raises:
-        UsageError, MeasurementError, RobotError: for a file that is missing, or a place that cannot be.
+        UsageError, MeasurementError, RobotError: for a missing file, or an impossible placement.
     """
     for name in (table.lens, table.board):
         require((folder / name).is_file(), f"{where}: camera: no file '{name}' next to it", UsageError)

@@ -137,7 +137,7 @@ class TargetTable:
 @strict
 @dataclass(frozen=True)
 class PlacedTable:
-    """A table with a placement: xyz and rpy, or a matrix."""
+    """A table with a placement: xyz [m] and rpy [rad], or a matrix."""
 
     xyz: Point | None = None
     rpy: Turns | None = None
@@ -255,6 +255,6 @@ def beside(path: Path) -> dict[str, Path]:
 
 
 def rising(span: tuple[float, ...], where: str) -> None:
-    """Raise an error unless a span has two numbers, the lower one first."""
+    """Raise a ValueError unless a span has two numbers, the lower one first."""
     require(len(span) == 2, f"{where}: expected a list of 2 numbers, lower and upper, found {len(span)}", ValueError)
     require(span[0] < span[1], f"{where}: {span[0]:g} is not below {span[1]:g}", ValueError)

@@ -1,16 +1,16 @@
 """A measuring run: poses in the fastest order, collision-free paths between them, and the duration.
 
-Moves are straight in joint space, as a controller's joint moves are, held against the arm, the floor and obstacles at
-places so dense that no point of the arm goes further than the clearance between two of them. Where a straight move does
-not keep clear, via-points lead around; the arm is taken to stop at each.
+Moves are straight in joint space, like a controller's joint moves. They are checked against the arm, the floor and
+obstacles at samples so dense that no point of the arm moves further than the clearance between two samples. If a
+straight move collides, via-points lead around; the arm is assumed to stop at each of them.
 
 The file of a run has a row per stop, in time order::
 
     t [s], pose, joint1 [deg], …     pose: number of the pose in its list, counted from 1; 0 for a via-point
 
-Where no clear way leads to a pose, a candidate takes its place that one leads to. The same pose on another turn of its
-joints comes first. Of the candidates the one is taken that leaves most of the criterion among those that a straight
-move reaches, or, where there are none, among the best few by via-points.
+If no collision-free path leads to a pose, a reachable candidate replaces it. The same pose with a joint turned by 360°
+is tried first; then the candidate that keeps most of the criterion among those reached by a straight move, or, if there
+are none, among the best few reached by via-points.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ SAME_POSE = 1e-9
 
 
 class MoveLimits(Protocol):
-    """Limits that moves keep, see `calib.procedure.measuring.pose_limits.Limits`."""
+    """Limits that moves must respect, see `calib.procedure.measuring.pose_limits.Limits`."""
 
     @property
     def lower(self) -> np.ndarray:
@@ -89,12 +89,12 @@ class MoveLimits(Protocol):
 
     @property
     def collision(self) -> DistanceModel | None:
-        """Collision model, or None."""
+        """Collision model; None if collisions are not checked."""
         ...
 
     @property
     def clearance(self) -> float:
-        """Distance that the model asks for [m]."""
+        """Least distance that the collision model has to keep [m]."""
         ...
 
 
@@ -107,13 +107,13 @@ class MeasuringRun:
     """A run through m poses: order, paths between poses, and times.
 
     Attributes:
-        order: (m,) the poses' numbers in the order they are visited.
-        ways: m - 1 ways (k, n) from one to the next, both included [rad or m].
-        times: (m - 1,) how long each lasts [s].
-        dwell: at each pose [s].
-        found: duration in the order the poses came in, by straight moves, clear or not [s].
-        around: how many ways lead around something.
-        blocked: numbers of the ways for which no clear one was found; they are straight.
+        order: (m,) indices of the poses in the order in which they are visited.
+        ways: m - 1 paths (k, n) from each pose to the next, both included [rad or m].
+        times: (m - 1,) duration of each path [s].
+        dwell: time at each pose [s].
+        found: duration of the run in the input order of the poses, by straight moves, collision-free or not [s].
+        around: number of paths with via-points.
+        blocked: indices of the paths for which no collision-free one was found; they are straight.
     """
 
     order: np.ndarray
@@ -137,7 +137,7 @@ class MeasuringRun:
 
     @property
     def cut_off(self) -> tuple[int, ...]:
-        """Indices of the poses (in input order) without a clear path from the largest connected group."""
+        """Indices of the poses (in input order) without a collision-free path from the largest connected group."""
         groups = np.split(self.order, np.array(self.blocked, dtype=int) + 1)
         largest = max(groups, key=len)
         separate: list[int] = []
@@ -148,7 +148,7 @@ class MeasuringRun:
 
     @property
     def seconds(self) -> float:
-        """The run's duration [s]."""
+        """Duration of the run [s]."""
         return float(self.times.sum()) + self.dwell * len(self.order)
 
 
@@ -163,16 +163,17 @@ def plan_run(
 ) -> MeasuringRun:
     """Return the run through poses q (m, n) [rad or m]: their order, and the paths between them.
 
-    Where an order is left with a pair that no clear way was found for, the ways found so far serve: from one pose to
-    another by way of third ones.
+    If no collision-free path was found between consecutive poses, a path through other poses replaces it.
 
     Args:
         chain: the arm, for its speeds.
-        limits: with lower, upper, collision and clearance (`calib.procedure.measuring.pose_limits.Limits`).
-        settings: speed and dwell.
-        seed: of the search for ways around.
-        progress: called with a few words now and then.
-        clear: clear ways from an earlier run, see `MeasuringRun.found_ways`; those between other postures are left out.
+        q: the poses.
+        limits: lower, upper, collision and clearance (`calib.procedure.measuring.pose_limits.Limits`).
+        settings: speed and dwell time.
+        seed: seed of the search for via-points.
+        progress: called with a text on the progress; None: silent.
+        clear: collision-free paths from an earlier run, see `MeasuringRun.found_ways`; paths between other postures are
+            ignored; None: none.
     """
     show = progress or _silent
     velocity, acceleration = _speeds(chain, settings.speed)
@@ -236,9 +237,9 @@ def plan_run(
 def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
     """Return the poses (m, n) with each revolute joint within one turn, cut in the largest gap between its angles.
 
-    A joint with more than one turn can stand everywhere on two; the cut is the middle of the largest gap between the
-    poses' angles (where there is one of more than 30 degrees, else half a turn from the middle of the range), so that
-    moves between them need not go the long way round.
+    A joint with a range above one turn reaches every angle at two values. The cut is the middle of the largest gap
+    between
+    the poses' angles (if above 30 degrees, else half a turn from the middle of the range), so that moves are short.
     """
     full = 2 * np.pi
     result = q.copy()
@@ -308,10 +309,10 @@ def way_to(
     straight: bool,
     seed: int = 0,
 ) -> tuple[int, np.ndarray] | None:
-    """Return a clear path (k, n) from one of m starts to one of p postures, and the start's index; None: not found.
+    """Return a collision-free path (k, n) from one of m starts to one of p postures, and the start's index; or None.
 
-    The moves of least time are tried, for each of the `MAX_NEIGHBOURS` nearest postures: straight ones from the
-    `MAX_NEIGHBOURS` nearest of the starts, or with via-points from the nearest.
+    For each of the `MAX_NEIGHBOURS` nearest postures, the moves of shortest duration are tried: straight moves from the
+    `MAX_NEIGHBOURS` nearest starts, or (without `straight`) moves with via-points from the nearest start.
     """
     velocity, acceleration = _speeds(chain, settings.speed)
     room = _room(chain, limits, velocity)
@@ -330,7 +331,9 @@ def _pair(start: int, end: int) -> tuple[int, int]:
 
 
 def _clear_at_places(room: Room, q: np.ndarray) -> np.ndarray:
-    """Return (m, m) flags: straight moves clear at `PLACES` places (an estimate, used to order the poses)."""
+    """Return (m, m) flags: whether straight moves are clear at `PLACES` samples (an estimate, used to order the
+    poses).
+    """
     start, end = np.triu_indices(len(q), 1)
     share = ((np.arange(PLACES) + 0.5) / PLACES)[:, None, None]
     postures = (q[start] + share * (q[end] - q[start])).reshape(-1, q.shape[1])
@@ -393,7 +396,7 @@ def _speeds(chain: Chain, share: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _room(chain: Chain, limits: MoveLimits, velocity: np.ndarray) -> Room:
-    """Return the collision test of paths: it requires half the clearance at places at most one clearance apart."""
+    """Return the collision test of paths: it requires half the clearance at samples at most one clearance apart."""
     model, clearance = limits.collision, limits.clearance
     reach = np.array([chain.stretched_length() if joint.kind == "revolute" else 1.0 for joint in chain.joints])
 
@@ -413,8 +416,8 @@ class Exchange:
     Attributes:
         jacobian: q (m, n) -> whitened observation Jacobians (m, rows, p).
         candidates: (N, n) feasible poses [rad or m].
-        before: (k, rows, p) of poses measured before; None without them.
-        index: that counts.
+        before: (k, rows, p) Jacobians of poses measured before; None without them.
+        index: observability index that ranks the candidates.
     """
 
     jacobian: Callable[[np.ndarray], np.ndarray]
@@ -429,7 +432,9 @@ class Exchange:
         return observability(rows, self.index), float(log_det(flat.T @ flat)) / rows.shape[2]
 
     def ranked(self, q: np.ndarray) -> np.ndarray:
-        """Return the candidates' numbers (N,), best first, by the index of each together with poses (m, n)."""
+        """Return the indices (N,) of the candidates, sorted by the index of each together with poses (m, n), best
+        first.
+        """
         rows = self._rows(q)
         flat = rows.reshape(-1, rows.shape[2])
         matrices = flat.T @ flat + self._information
@@ -457,11 +462,11 @@ class Drivable:
     """Reachable poses, and the run through them.
 
     Attributes:
-        q: (m, n) in the order they came, each revolute joint on the turn it is driven on [rad or m].
-        run: through them.
-        replaced: places in the list -> candidate that stands there, since no clear way led to what stood there.
-        value: the index before and after.
-        gain: in log det(WᵀW) / p.
+        q: (m, n) poses in input order, each revolute joint on the turn that the run uses [rad or m].
+        run: run through the poses.
+        replaced: index of a pose that no collision-free path reached -> index of the candidate that replaces it.
+        value: observability index before and after the replacements.
+        gain: change of log det(WᵀW) / p by the replacements.
     """
 
     q: np.ndarray
@@ -472,7 +477,7 @@ class Drivable:
 
     @property
     def words(self) -> str:
-        """Sentence on the replaced poses, numbered from 1 in the order of the run; "" without replacements."""
+        """Sentence on the replaced poses, numbered from 1 in the order of the run; empty without replacements."""
         if not self.replaced:
             return ""
         numbers = [f"{k}" for k, index in enumerate(self.run.order, 1) if index in self.replaced]
@@ -495,11 +500,12 @@ def drivable(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Drivable:
-    """Return the run through poses q (m, n), in which poses without a clear path are replaced by candidates.
+    """Return the run through poses q (m, n), in which poses without a collision-free path are replaced by candidates.
 
     Args:
         chain, limits, settings, seed, progress: see `calib.procedure.measuring.measuring_run.plan_run`.
-        exchange: what poses are replaced from.
+        q: the poses [rad or m].
+        exchange: candidates for replacements.
     """
     show = progress or _silent
     replaced: dict[int, int] = {}
@@ -528,7 +534,7 @@ def _rejoined(
     settings: RunSettings,
     seed: int,
 ) -> tuple[np.ndarray, dict[int, int], Ways]:
-    """Return the poses (m, n) with unreachable ones replaced, the replacements (place -> candidate), and all paths."""
+    """Return the poses (m, n) with unreachable ones replaced, replacements (pose -> candidate index), and all paths."""
     q = q.copy()
     replacements: dict[int, int] = {}
     clear_ways = run.found_ways

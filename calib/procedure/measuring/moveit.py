@@ -63,14 +63,14 @@ def moveit_files(path: Path) -> list[Path]:
 
 
 def limit_tables(path: Path, chain: Chain, source: Path | None) -> ParsedTable | None:
-    """Return the tables of a limits file from MoveIt's files; None where the path names none.
+    """Return the tables of a limits file from MoveIt's files; None if the path is not a MoveIt file or folder.
 
     Args:
-        path: of a file, or of a folder with both.
+        path: a file, or a folder with both files.
         chain, source: the arm, and its file.
 
     Raises:
-        UsageError: for files that cannot be read, or that are another robot's.
+        UsageError: for files that cannot be read, or that belong to another robot.
     """
     tables: ParsedTable = {}
     for file in moveit_files(path):
@@ -118,7 +118,7 @@ def _limits(path: Path, chain: Chain, source: Path | None) -> ParsedTable:
 
 
 def _limit(limits: Mapping[str, object], quantity: str, end: str, where: str) -> float | None:
-    """Return a joint's limit; None where it is not stated, or switched off."""
+    """Return a joint's limit; None if it is not stated, or switched off by ``has_..._limits: false``."""
     key = f"{end}_{quantity}"
     if not limits.get(f"has_{quantity}_limits", True) or key not in limits:
         return None
@@ -131,7 +131,7 @@ def _yaml(path: Path) -> object:
     from ruamel.yaml.error import YAMLError
 
     class Angles(SafeConstructor):
-        """Numbers and texts, and angles with ``!degrees`` or ``!radians``."""
+        """YAML reader for numbers and texts, and for angles with ``!degrees`` or ``!radians``."""
 
     def angle(factor: float) -> Callable[[object, ScalarNode], float]:
         return lambda loader, node: factor * number(node.value.strip(), f"{path}: {node.tag}")
@@ -145,7 +145,7 @@ def _yaml(path: Path) -> object:
 
 
 def _pairs(path: Path, chain: Chain, source: Path | None) -> ParsedTable:
-    """Return the table [collision] of an SRDF: its disabled pairs, of links that the robot has."""
+    """Return the table [collision] of an SRDF: its disabled pairs of links that the robot has."""
     with refused_as(UsageError, (OSError, UnicodeDecodeError), f"{path}: cannot be read: {{}}"):
         root = parse(path.read_text(encoding="utf-8"), str(path))
     attributes = [node.attributes for node in root.all("disable_collisions")]

@@ -1,8 +1,8 @@
 """Limits on the arm's poses during measurement, from the constraints file, the cell and the defaults.
 
-With no file, and wherever it says nothing else, poses keep a share of each joint's range to its limits, distance
-between the arm's own links, and the floor that the arm stands on: `Limits.checked` says what was kept, and
-`Limits.unchecked` names what could not be, since nobody has stated it.
+By default, poses keep a margin to the joint limits, a distance between the arm's own links, and a distance from the
+floor that the arm stands on. `Limits.checked` lists the limits that were checked, `Limits.unchecked` those that could
+not be checked because they were not stated.
 """
 
 from __future__ import annotations
@@ -58,14 +58,16 @@ class Limits:
     """Limits of poses: joint limits (n,), constraints of the target, collisions and lines of sight.
 
     Attributes:
-        collision: a `calib.robot.collision.Collision` or `calib.robot.capsules.Capsules`; None without one.
-        clearance: the least distance it asks for [m].
-        sight: lines of sight; None where nothing is asked.
-        camera: the view of a camera (`calib.procedure.measuring.camera_view.CameraView`), where that is the instrument.
-        views: what it takes to be seen by it.
+        lower, upper: (n,) joint limits [rad or m].
+        constraints: constraints on the target.
+        notes: other remarks for the user.
+        collision: a `calib.robot.collision.Collision` or `calib.robot.capsules.Capsules`; None: not checked.
+        clearance: least distance between links, and from obstacles [m].
+        sight: lines of sight from an instrument; None without conditions on them.
         checked: names of the checked limits.
-        unchecked: names of the limits that are not checked, since nobody has stated them.
-        notes: what else a user should know.
+        unchecked: names of the limits that are not checked because they were not stated.
+        camera: view of a camera (`calib.procedure.measuring.camera_view.CameraView`) that measures; None without one.
+        views: constraints under which the camera sees the board.
     """
 
     lower: np.ndarray
@@ -84,8 +86,8 @@ class Limits:
         """Return the search space of pose selection: the observation Jacobian, joint limits and constraints.
 
         Args:
-            observation: all targets' rows.
-            sight: False leaves out what it takes to be seen, to tell what that costs.
+            observation: observation Jacobian with the rows of all targets.
+            sight: whether line-of-sight and view constraints apply; False to compute the accuracy lost by them.
         """
         # constraints that are quick to compute, and exclude most, come first
         constraints = [*self.constraints]
@@ -117,13 +119,13 @@ def _shortfall_gradient(model: DistanceModel, q: np.ndarray) -> np.ndarray:
 def read_limits(
     tables: Tables | None, cell: Installation, source: Path | None = None, without: Sequence[str] = ()
 ) -> Limits:
-    """Read the constraints for an arm with its targets.
+    """Return the pose limits of an arm with its targets, read from a constraints file.
 
     Args:
-        tables: the file, or its tables; None for the defaults alone. Tables of motions (`MOTION`) may stand in it.
+        tables: the file, or its tables, which may include tables of motions (`MOTION`); None: defaults only.
         cell: the arm, see `calib.geometry.observability.targets_of`.
-        source: the robot's file, whose collision shapes are used where it is a URDF.
-        without: names of `DEFAULTS` not to keep, and of `CELL` that are not there.
+        source: the robot's file; the collision shapes of a URDF are used.
+        without: names of `DEFAULTS` that do not apply, and of `CELL` objects that the cell does not have.
 
     Raises:
         UsageError: for an unknown key or a value that a key cannot have.
@@ -144,13 +146,13 @@ def read_limits(
 
 
 def tables_of(tables: Tables | None, chain: Chain, source: Path | None, name: str) -> tuple[Tables | None, str]:
-    """Return limits as a file or tables, from MoveIt's files where they are such, and their name.
+    """Return the limits as a file or tables (MoveIt's files are converted to tables), and their name for messages.
 
     Args:
-        tables: a file, a folder, or tables, which are named by `name`.
+        tables: a file, a folder, or tables; None: none.
         chain: the arm.
-        source: its file.
-        name: of tables.
+        source: the arm's file.
+        name: name of tables in messages.
     """
     if isinstance(tables, str | Path):
         content = limit_tables(Path(tables), chain, source)
@@ -193,7 +195,7 @@ def limits_of(
     """Return the pose limits of an arm from the content of a constraints file; see `read_limits`.
 
     Args:
-        measured: False for motions, which nothing measures: no lines of sight.
+        measured: whether the poses are measured; False for motions, without lines of sight.
     """
     absent = {*settings.without, *without}
     collision = settings.collision or CollisionTable()
@@ -324,9 +326,9 @@ def _orientation(settings: ConstraintsFile, cell: Installation, where: str) -> l
 
 
 def _sight(settings: ConstraintsFile, cell: Installation, where: str, model: DistanceModel | None) -> Sight | None:
-    """Return the lines of sight: cone and range if given, and no link of the arm in between.
+    """Return the lines of sight: cone and range if stated, and no link of the arm in between; None if not required.
 
-    An instrument with roll and pitch alone is a camera whose view these state.
+    An instrument for which only roll and pitch are stated is a camera, whose view these limit.
     """
     table, facing = settings.instrument, settings.target.facing
     if table is None:
@@ -347,7 +349,7 @@ def _sight(settings: ConstraintsFile, cell: Installation, where: str, model: Dis
 def _collision(
     settings: ConstraintsFile, cell: Installation, source: Path | None, where: str, absent: set[str]
 ) -> tuple[DistanceModel, tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """Return the collision model, the names of its checks, notes, and what it does not check."""
+    """Return the collision model, the names of its checks, notes, and the names of what it does not check."""
     table = settings.collision or CollisionTable()
     floor = table.floor
     if floor is None and "floor" not in absent:
@@ -393,7 +395,7 @@ def _never_act(
     """Return the names of walls and obstacles that the arm cannot reach, and a note on each.
 
     Raises:
-        UsageError: for what stands `MAX_REACHES` times as far, and for links thicker than the arm is long.
+        UsageError: for a wall or obstacle at `MAX_REACHES` times the reach, and for links thicker than the arm is long.
     """
     strokes = [max(-joint.lower, joint.upper) for joint in cell.chain.joints if joint.unit == "m"]
     reach = cell.reach + sum(strokes)
@@ -431,7 +433,7 @@ def _model(
     self_collision: bool,
     floor: float | None,
 ) -> tuple[DistanceModel, str, tuple[str, ...], tuple[str, ...]]:
-    """Return the collision model, the name of its link shapes, notes, and links that it does not hold."""
+    """Return the collision model, the name of its link shapes, notes, and the links that it does not contain."""
     from calib.robot import capsules, collision
     from calib.robot.beside import links_beside
 
@@ -508,9 +510,9 @@ def _posture(values: Mapping[str, object], chain: Chain, source: Path | None) ->
 
 
 def _description(source: Path | None, chain: Chain) -> Path | None:
-    """Return the URDF that an arm's file is, or that a fit's ``robot.toml`` was made from; None where it is not found.
+    """Return the arm's URDF: its file, or the source of a fit's ``robot.toml``; None if it is not found.
 
-    It is sought where the fit found it, and beside a session's fit.
+    The source is searched at the path that the fit stored, and next to a session's fit.
     """
     if source is None or is_urdf(source):
         return source
@@ -528,7 +530,7 @@ def _description(source: Path | None, chain: Chain) -> Path | None:
 
 
 def _walls(box: tuple[tuple[object, object], ...] | None, where: str) -> list[Wall]:
-    """Return the two walls across each axis."""
+    """Return the two walls across each axis of a box; [] without a box."""
     walls = []
     for axis, normal, span in zip("xyz", np.eye(3), box or ()):
         low, high = _span(span, f"{where}: {axis}", "length")

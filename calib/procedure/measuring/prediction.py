@@ -1,10 +1,10 @@
 """Predicted accuracy of a set of poses before the robot moves: σ of parameters and of the tool's position.
 
 With W the whitened observation Jacobian of the poses, C = (WᵀW)⁻¹ is the covariance that the fit will state if the
-measurements are as noisy as said and the model is the geometry that the poses were chosen for; a tool's position then
-has the variance tr(J C Jᵀ), J its Jacobian. Effects that the fit adds, and errors that no parameter holds, add to it.
+assumed noise is right and the model is the geometry that the poses were chosen for; a tool's position with the Jacobian
+J then has the variance tr(J C Jᵀ). Further effects in the fitted model, and errors that no parameter models, add to it.
 
-``calib select --out poses.csv`` leaves ``poses_prediction.json``; ``calib fit --selection poses.csv`` reads it.
+``calib select --out poses.csv`` writes ``poses_prediction.json``; ``calib fit --selection poses.csv`` reads it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -39,12 +39,12 @@ QUANTITIES = (("m", "lengths", "mm"), ("rad", "angles", "mrad"))
 
 @dataclass(frozen=True, eq=False)
 class SelectionPrediction:
-    """The prediction for a selection: robot, number of poses, and sigmas of the parameters.
+    """The prediction for a selection: robot, number of poses, and σ of the parameters.
 
     Attributes:
-        joints: (n,) of the robot, by name.
-        poses: how many were chosen.
-        names, units, sigmas: (p,) of the parameters [m, rad].
+        joints: (n,) names of the robot's joints.
+        poses: number of selected poses.
+        names, units, sigmas: (p,) names, units (m or rad) and predicted σ of the parameters.
     """
 
     joints: tuple[str, ...]
@@ -54,7 +54,7 @@ class SelectionPrediction:
     sigmas: Array
 
     def check_robot(self, joints: Sequence[str]) -> None:
-        """Raise an error if the selection belongs to a robot with other joints."""
+        """Raise a UsageError if the selection belongs to a robot with other joints."""
         if self.joints != tuple(joints):
             selection_joints = ", ".join(self.joints)
             raise UsageError(
@@ -65,11 +65,11 @@ class SelectionPrediction:
 
 @dataclass(frozen=True, eq=False)
 class Prediction(SelectionPrediction):
-    """Predicted accuracy of a fit to m poses: sigmas of the parameters, and of the tool's position.
+    """Predicted accuracy of a fit to m poses: σ of the parameters, and of the tool's position.
 
     Attributes:
-        points, spread: (s, 3), (s,): where the tool is at typical poses, and sigma of its position there [m]; infinite
-            where a parameter is not identifiable.
+        points: (s, 3) positions of the tool at typical poses [m].
+        spread: (s,) σ of the tool's position at these poses [m]; infinite if a parameter is not identifiable.
     """
 
     points: np.ndarray
@@ -77,12 +77,14 @@ class Prediction(SelectionPrediction):
 
     @property
     def rms(self) -> float:
-        """Sigma of the tool's position, rms over typical poses [m]."""
+        """σ of the tool's position, rms over typical poses [m]; infinite if a parameter is not identifiable."""
         return float(np.sqrt(np.mean(self.spread**2)))
 
     @property
     def worst(self) -> float:
-        """Sigma of the tool's position, 95 % quantile over typical poses [m]."""
+        """σ of the tool's position, 95 % quantile over typical poses [m]; infinite if a parameter is not
+        identifiable.
+        """
         if not np.isfinite(self.spread).all():
             return float("inf")
         return float(np.quantile(self.spread, WORST))
@@ -94,10 +96,10 @@ def predicted(
     """Return the predicted accuracy of a fit from its Jacobians (m, rows, p), at typical poses (s, n).
 
     Args:
-        observation: the observation Jacobian they come from.
-        jacobians: whitened; of all that will have been measured.
-        typical: where the tool's position matters [rad or m].
-        poses: the number to say; by default m.
+        observation: observation Jacobian that the Jacobians were computed with.
+        jacobians: whitened Jacobians of all poses to be fitted, including those measured before.
+        typical: joint values at which the tool's accuracy is predicted [rad or m].
+        poses: number of poses that the prediction states; None: m.
     """
     rows = jacobians.reshape(-1, jacobians.shape[2])
     scale = np.maximum(np.linalg.norm(rows, axis=0), TINY)
@@ -128,12 +130,12 @@ def predicted(
 def by_count(
     observation: Observation, candidates: np.ndarray, typical: np.ndarray, before: np.ndarray | None = None
 ) -> tuple[Prediction, ...]:
-    """Return the predicted accuracy with `COUNTS` poses each, chosen greedily among candidates (N, rows, p).
+    """Return the predicted accuracy with each of `COUNTS` poses, chosen greedily among candidates (N, rows, p).
 
     Args:
         observation, typical: see `predicted`.
-        candidates: whitened Jacobians.
-        before: (k, rows, p) Jacobians of poses measured before.
+        candidates: whitened Jacobians of the candidates.
+        before: (k, rows, p) Jacobians of poses measured before; None without them.
     """
     counts = [count for count in COUNTS if count <= len(candidates)]
     if not counts:
@@ -227,8 +229,8 @@ def sigma_ratio(
     """Return a finding on the ratios of estimated to predicted σ of parameters; None without common names.
 
     Args:
-        predicted, estimated: name -> σ.
-        residual, assumed: of the torque, as shares of the limits, where it is known.
+        predicted, estimated: parameter name -> σ.
+        residual, assumed: measured and assumed torque error as shares of the torque limits; None if unknown.
     """
     common = [name for name in predicted if estimated.get(name, 0.0) > 0.0 and predicted[name] > 0.0]
     if not common:

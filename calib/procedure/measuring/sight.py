@@ -1,7 +1,7 @@
-"""Lines of sight from an instrument to its targets: limits on cone of acceptance, range, and links in between.
+"""Lines of sight from an instrument to its targets: limits on acceptance cone, range, and links in between.
 
-With several targets (reflectors on one plate, each with a direction of its own) a pose counts if one of them is seen,
-and only the rows of those that are seen count in the observation Jacobian: what faces away counts for nothing.
+With several targets (reflectors on a plate, each with its own direction), a pose is feasible if one target is seen, and
+the observation Jacobian contains only the rows of the targets that are seen.
 """
 
 from __future__ import annotations
@@ -35,9 +35,13 @@ class _Behind:
     """Constraint (m, `DISTANCES`) that keeps links off a line of sight: `BEAM` minus the nearest links' distances.
 
     Attributes:
-        arm: with a method ``beam``, see `calib.robot.capsules.Capsules.beam`.
-        links: which of its links are looked at: not those that the target sits on or beside in every posture, which
-            the direction it faces is there for.
+        arm: collision model with a method ``beam``, see `calib.robot.capsules.Capsules.beam`.
+        target: pose of the target as a function of q.
+        velocity: Jacobian of the target as a function of q.
+        instrument: (3,) position of the instrument in the arm's base [m].
+        links: indices of the links that can block the view; links next to the target in every posture are excluded,
+            since
+            the direction that the target faces accounts for them.
     """
 
     arm: DistanceModel
@@ -50,7 +54,7 @@ class _Behind:
         return self._nearest(q)[0]
 
     def gradient(self, q: np.ndarray) -> np.ndarray:
-        """Return the derivatives (m, `DISTANCES`, n)."""
+        """Return the derivatives (m, `DISTANCES`, n) of the constraint with respect to q (m, n)."""
         return self._nearest(q)[1]
 
     def _nearest(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -69,7 +73,7 @@ class Sight:
     """The lines of sight from an instrument to the targets of an arm.
 
     Attributes:
-        targets: for each target what it takes to be seen.
+        targets: for each target, the constraints under which it is seen.
     """
 
     targets: tuple[tuple[PoseConstraint, ...], ...]
@@ -110,7 +114,7 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class SeenOnly:
-    """Observation Jacobian with zero rows for targets that are not seen."""
+    """Observation Jacobian whose rows are zero for targets that are not seen."""
 
     of: Observation
     sight: Sight
@@ -119,7 +123,7 @@ class SeenOnly:
         return self.of(q) * self._mask(q)
 
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-        """Return Σ G[i] · ∂J[i]/∂q (m, n), for an unchanged set of seen targets."""
+        """Return the gradient (m, n) of Σ G · J with respect to q, for an unchanged set of seen targets."""
         return self.of.product(q, G * self._mask(q))
 
     def _mask(self, q: np.ndarray) -> np.ndarray:
@@ -141,11 +145,11 @@ def sight_of(
 
     Args:
         cell: the arm with its T targets.
-        instrument: (3,) where it stands in the arm's base [m].
-        facing: (T, 3) the direction each target faces, in its own frame; a single one for all.
-        half_angle: of the cone of acceptance [rad]; None: all around.
+        instrument: (3,) position of the instrument in the arm's base [m].
+        facing: (T, 3) direction that each target faces, in its own frame; a single one applies to all.
+        half_angle: half angle of the acceptance cone [rad]; None: no limit.
         span: least and largest distance [m].
-        arm: what may stand in the way (`_Behind`); None: nothing does.
+        arm: model of the arm's links, which may block the view (`_Behind`); None: not checked.
     """
     directions = [*facing]
     if len(facing) == 1:

@@ -1,6 +1,6 @@
-"""Figures as values: a `Chart` is a grid of `Panel`s, a panel some layers over two axes; `figure` draws a chart.
+"""Figures as values: a `Chart` is a grid of `Panel`s, a panel has layers over two axes; `figure` draws a chart.
 
-Layers are lines, bars, marked levels, words, coloured dots, heat maps, histograms and boxes: nine ways to show numbers.
+Layers are lines, bars, marked levels, texts, coloured dots, heat maps, histograms and boxes.
 """
 
 import pickle
@@ -37,9 +37,9 @@ Layer = Callable[..., None]  # draws onto the axes of a panel, whose scales are 
 
 
 def layer(draw: Callable[Concatenate[Axes, P], None]) -> Callable[P, Layer]:
-    """Return a function that makes a layer from a drawing function; its arguments are the same, without the axes.
+    """Return a function that makes a layer from a drawing function; it takes the same arguments except the axes.
 
-    What it returns can be pickled, which the cache of drawn pictures needs.
+    Its layers can be pickled, which the cache of drawn pictures needs.
     """
 
     @wraps(draw)
@@ -98,7 +98,9 @@ def bars(
     spread: ArrayLike | None = None,
     label: str = "",
 ) -> None:
-    """Draw bars (k,) from `base` at 0, 1, …, in one colour or one each; `spread` (k,): half the error bars' length."""
+    """Draw bars (k,) from `base` at 0, 1, …; one colour for all or one per bar; `spread` (k,): half the error bars'
+    length.
+    """
     values = np.asarray(values, dtype=float)
     position = np.arange(len(values)) + shift
     options: dict[str, Any] = {"color": colours, "label": label}
@@ -195,9 +197,11 @@ def heat(
     """Draw a colour map of values (rows, columns) with a colour bar, row 0 at the top, NaN white.
 
     Args:
-        extent: left, right, bottom, top; by default cell k is at k.
-        limits: of the colours; from 0 by default.
-        written: whether values stand in their cells.
+        unit: title of the colour bar.
+        extent: left, right, bottom, top of the map; None: cell k is at k.
+        limits: values of the first and the last colour; None: the largest value.
+        colours: name of the colour map.
+        written: whether each cell shows its value.
     """
     low, high = limits
     aspect: Literal["equal", "auto"] = "equal" if extent else "auto"
@@ -218,7 +222,7 @@ def histogram(axes: Axes, counts: ArrayLike, edges: ArrayLike, colour: str = AFT
 
 @layer
 def box(axes: Axes, values: ArrayLike, place: float, colour: str = AFTER) -> None:
-    """Draw a box plot of values (k,) at a place on y: quartiles and median, 5th and 95th percentile, points beyond."""
+    """Draw a box plot of values (k,) at a y position: quartiles and median, 5th and 95th percentile, points beyond."""
     axes.boxplot(
         [values],
         positions=[place],
@@ -247,15 +251,15 @@ class Panel:
     """A panel of a chart: layers over two axes.
 
     Attributes:
-        layers: drawn in their order.
-        title, x, y: words at the top and at the axes.
-        xlim, ylim: limits, or what the layers need.
-        log: letters of the axes that are logarithmic (their limits are needed).
-        xnames, ynames: labels at 0, 1, … instead of numbers; x names of one line stand upright.
-        grid: ``x``, ``y``, ``both`` or none.
-        equal: one scale for both axes.
-        symlog: the y axis is linear up to there from zero, and logarithmic beyond; 0: all linear.
-        ticks: at most about so many numbers at an axis.
+        layers: layers in drawing order.
+        title, x, y: title, and labels of the axes.
+        xlim, ylim: limits of the axes; None: as the layers need.
+        log: letters of the axes that are logarithmic (their limits are required).
+        xnames, ynames: labels at 0, 1, … instead of numbers; x labels of one line are vertical; None: numbers.
+        grid: axes with grid lines: ``x``, ``y``, ``both`` or empty.
+        equal: whether both axes have the same scale.
+        symlog: the y axis is linear between ± this value and logarithmic beyond; 0: all linear.
+        ticks: approximate largest number of ticks per axis; 0: default.
     """
 
     layers: Sequence[Layer]
@@ -313,12 +317,11 @@ class Chart:
     """A figure as a value: panels, row by row.
 
     Attributes:
-        panels: at least one.
-        height: of the figure [in].
-        columns: panels in a row.
-        width: of the figure [in].
-        title: of the whole, at its head; the labels of the first panel's layers stand there, too.
-        shared: letters of the axes labelled at the lowest panel of a column, and at the first of a row, only.
+        panels: at least one panel.
+        height, width: size of the figure [in].
+        columns: number of panels in a row.
+        title: title of the figure, next to which the legend of the first panel is drawn; empty: none.
+        shared: letters of the axes that are labelled only at the lowest panel of a column and at the first of a row.
     """
 
     panels: Sequence[Panel]
@@ -355,7 +358,7 @@ def figure(chart: Chart) -> Figure:
 
 
 def picture(chart: Chart, caption: str) -> Picture:
-    """Return a chart with a caption as a picture for a page, from the cache if it was drawn before."""
+    """Return a chart with a caption as a picture for a page; charts drawn before come from a cache."""
     return Picture(_drawn(pickle.dumps(chart)), caption, chart.width > style.HALF_WIDTH, chart)
 
 

@@ -36,7 +36,8 @@ def captioned(report: DynamicReport, folder: Path | None = None) -> dict[str, Ca
     """Return the charts of an identification's report with captions, by name; charts without data are omitted.
 
     Args:
-        folder: of the identification, for its comparison with the nominal geometry.
+        report: report of the identification.
+        folder: folder of the identification, for its comparison with the nominal geometry; None: without this chart.
     """
     unseen = report.unseen
     result = _error_charts(unseen)
@@ -80,10 +81,11 @@ def recorded(curves: TorqueCurves, report: UnseenReport) -> Captioned:
 
 
 def friction(outcome: IdentificationOutcome) -> dict[str, Chart]:
-    """Return the chart of friction over velocity, by its name; of mechanisms none.
+    """Return the chart of friction over velocity as ``friction`` -> chart; {} for mechanisms.
 
-    It shows the model, and the torques of the first file minus the rigid-body model; the model alone where a row is not
-    of one joint (power).
+    It shows the friction model, and the torques of the first training recording minus the rigid-body model. If a torque
+    row
+    belongs to several joints (power), it shows the model only.
     """
     if isinstance(outcome.inputs.robot, Mechanism):
         return {}
@@ -126,7 +128,7 @@ def friction(outcome: IdentificationOutcome) -> dict[str, Chart]:
 
 
 def _friction(column: DriveTerm, velocity: np.ndarray) -> np.ndarray:
-    """Return the values (N,) of a term of friction at velocities (N,), at position and acceleration zero."""
+    """Return the values (N,) of a friction term at velocities (N,), with position and acceleration zero."""
     zero = np.zeros(len(velocity))
     return column.values(TermMotion(zero, velocity, zero))
 
@@ -144,12 +146,12 @@ def torques(
     """Return the chart of measured torques, predicted torques and residuals over time.
 
     Args:
-        t: (N,) [s].
-        measured, predicted: (N, rows) [units].
+        t: (N,) times [s].
+        measured, predicted: (N, rows) torques [units].
         rows, units: names of the torque rows, and their units.
-        title: of the whole.
-        errors: relative error of each row [%]; none where it is not known.
-        band: to which the torques are low-passed [Hz]; NaN: they are as recorded.
+        title: title of the chart.
+        errors: relative error of each row [%]; empty if unknown.
+        band: cutoff to which the torques are low-passed [Hz]; NaN: as recorded.
     """
     time_label = "time [s]"
     if np.isfinite(band):
@@ -178,10 +180,10 @@ def autocorrelations(
     """Return the chart of the autocorrelation of each row's residual, with the bounds of white noise.
 
     Args:
-        whiteness: of each torque row; None of rows that are too short to say.
+        whiteness: autocorrelation of each torque row; None for rows with too few samples.
         rows: names of the torque rows.
-        title: of the whole.
-        width: of the figure [in].
+        title: title of the chart.
+        width: width of the figure [in].
     """
     panels = []
     for row, white in zip(rows, whiteness):
@@ -230,7 +232,7 @@ def _geometry_charts(effects: Sequence[GeometricEffect], comparison_file: Path |
 
 
 def _geometries(rows: Sequence[TwoGeometries]) -> Chart:
-    """Return the chart of parameters' values on both geometries, and of the differences in sigmas: the largest ones."""
+    """Return the chart of the parameters' values on both geometries, and of their differences in σ, largest first."""
     nominal = np.array([row.nominal for row in rows])
     calibrated = np.array([row.calibrated for row in rows])
     sigma_nominal = np.array([row.sigma_nominal for row in rows], dtype=float)
@@ -298,7 +300,7 @@ def _effects(rows: Sequence[GeometricEffect]) -> Chart:
 
 
 def _error_charts(unseen: UnseenReport) -> dict[str, Captioned]:
-    """Return the charts of each row's error [%] and of the autocorrelations, for the recording that decides."""
+    """Return the charts of each row's error [%] and autocorrelation, for the recording that decides the verdict."""
     _, proof, motion = proof_of(unseen)
     training = next(iter(unseen.fit.values()))
     training_errors = np.nan_to_num(training.raw.joints)
@@ -322,7 +324,7 @@ def _error_charts(unseen: UnseenReport) -> dict[str, Captioned]:
 
 
 def _significance(parameters: Sequence[IdentifiedParameter]) -> Captioned:
-    """Return the chart of each parameter's distance from zero in sigmas; values below two are not significant."""
+    """Return the chart of each parameter's distance from zero in σ; below two, a parameter is not significant."""
     value = np.array([row.value for row in parameters])
     sigma = np.array([row.sigma or 0.0 for row in parameters])
     # a logarithmic axis starts at 0.1

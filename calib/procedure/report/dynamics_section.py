@@ -96,10 +96,10 @@ class DynamicReport:
     """The stored results of an identification and its validation.
 
     Attributes:
-        metrics: of the identification.
+        metrics: metrics of the identification.
         estimate: the parameters.
-        effects: what the geometry's errors do to them; none where the geometry is taken as exact.
-        unseen: the model on unseen motion, with the verdict.
+        effects: effects of the geometry's errors on the parameters; empty if the geometry is taken as exact.
+        unseen: report of the model on unseen motion, with the verdict.
     """
 
     metrics: ModelMetrics
@@ -109,10 +109,10 @@ class DynamicReport:
 
 
 def read(folder: Path) -> DynamicReport:
-    """Read the results of the steps identify and predict.
+    """Read the results of an identification and of its validation from the folder of the identification.
 
     Raises:
-        UsageError: if it is missing or made by another version.
+        UsageError: if files are missing or were written by another version.
     """
     identification = IdentificationFolder(folder)
     effects_file = folder / geometry_tables.EFFECTS
@@ -128,7 +128,7 @@ def read(folder: Path) -> DynamicReport:
 
 
 def read_lines(inputs: IdentificationInputs) -> list[str]:
-    """Return lines on the robot and the recordings, as read."""
+    """Return text lines on the robot and the recordings, as read."""
     chain = inputs.chain
     lines = [str(inputs.robot)]
     if isinstance(chain, Chain):
@@ -155,7 +155,8 @@ def of_outcome(outcome: IdentificationOutcome, folder: Path | None = None) -> Dy
     """Return the report of an identification.
 
     Args:
-        folder: written for it, of which its parameters are read; None: without them.
+        outcome: the identification.
+        folder: folder of the identification, from which the parameters are read; None: the report has no parameters.
     """
     effects: Sequence[geometry_tables.GeometricEffect] = ()
     if outcome.carried is not None:
@@ -168,7 +169,7 @@ def of_outcome(outcome: IdentificationOutcome, folder: Path | None = None) -> Dy
 
 
 def outcome_section(outcome: IdentificationOutcome) -> page.Section:
-    """Return the console's section on an identification: that of its report, without figures and parameters."""
+    """Return the section for the console on an identification: that of its report, without figures and parameters."""
     return report_section(of_outcome(outcome), {})
 
 
@@ -182,10 +183,11 @@ def report_section(
     """Return the section of a report: errors on unseen motion, torques, excitation, and parameters.
 
     Args:
-        figures: by name (`dynamics_figures.captioned`); missing ones are left out.
-        exported: what the export had to say.
-        tolerance: largest error of the torque on unseen motion that is good enough [%]; 0: none.
-        delivered: error of the exported robot there [%]; None where it is not known.
+        report: report of the identification.
+        figures: figures by name (`dynamics_figures.captioned`); missing ones are omitted.
+        exported: remarks of the export.
+        tolerance: largest acceptable torque error on unseen motion [%]; 0: no tolerance.
+        delivered: torque error of the exported robot on unseen motion [%]; None if unknown.
     """
     metrics, unseen = report.metrics, report.unseen
     blocks: list[page.Block] = [_error_table(unseen), _reference_table(unseen), _interval_table(unseen)]
@@ -306,7 +308,9 @@ def _error_table(unseen: UnseenReport) -> page.ReportTable:
 
 
 def _error_rows(score: Score, unseen: UnseenReport) -> Iterator[Sequence[str]]:
-    """Yield the cells of `ERROR_HEADER`: of all torques, then of each."""
+    """Yield the rows of the error table, with the columns `ERROR_HEADER`: all torques together, then each torque
+    row.
+    """
     parts = score.raw, score.filtered, score.moving, score.standing
     totals = [percent(part.total) for part in parts]
     yield "all", "", "", *totals, "", ""

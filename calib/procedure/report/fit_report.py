@@ -1,4 +1,4 @@
-"""The data of a fit's report and certificate, plain numbers in ``report.json``, from which both can be made again."""
+"""Data of a fit's report and certificate, stored as plain numbers in ``report.json``, from which both are rendered."""
 
 from __future__ import annotations
 
@@ -72,14 +72,14 @@ class RowErrors:
     """Error sizes on one set of rows.
 
     Attributes:
-        name: of the set; ``fit``, or a validation file's.
-        unseen: whether the fit had not seen them.
-        poses: how many robot poses.
-        nominal, calibrated, urdf_alone: by nature, the errors of that arm [m, rad].
-        expected: radius within which 95 % of the calibrated arm's errors are to be [m]; empty where none is known.
-        q: (rows, n) joints, points (rows, 3) in the arm's base, and numbers of the file's rows, where there is one
-            error per row.
-        worst: the row with the calibrated arm's largest error, where only a sample of the rows stands here.
+        name: name of the set: ``fit``, or the validation file's name.
+        unseen: whether the fit had not seen the rows.
+        poses: number of robot poses.
+        nominal, calibrated, urdf_alone: nature (position, orientation, distance) -> errors of this arm [m, rad].
+        expected: predicted radius that contains 95 % of the calibrated arm's errors [m]; empty if unknown.
+        q: (rows, n) joint values, if there is one error per row; so are `points`, (rows, 3) in the arm's base [m], and
+            `rows`, row numbers in the file.
+        worst: the row with the calibrated arm's largest error, if the set is only a sample of the rows; else None.
     """
 
     name: str
@@ -95,13 +95,13 @@ class RowErrors:
     worst: RowErrors | None = None
 
     def judged(self, deliverable: str) -> Mapping[str, tuple[float, ...]]:
-        """Return the errors of the deliverable on which the verdict is based, by nature."""
+        """Return nature -> errors of the deliverable on which the verdict is based."""
         if deliverable == "urdf" and self.urdf_alone:
             return self.urdf_alone
         return self.calibrated
 
     def judged_arm(self, deliverable: str) -> str:
-        """Return the words for that deliverable."""
+        """Return the name, as text, of the deliverable on which the verdict is based."""
         with_corrections = deliverable != "urdf" and self.urdf_alone
         return ARM["corrections"] if with_corrections else ARM["urdf"]
 
@@ -111,18 +111,18 @@ class Report:
     """The outcome of a fit, as stored in JSON.
 
     Attributes:
-        robot: its name; base and tip links.
-        joints: names; ``prismatic`` says which slide.
-        metrics: as in ``metrics.json``.
-        parameters: all that were fitted.
-        kept: arm parameters that stayed at their nominal.
-        correlations: pairs that go together.
-        correlated: the parameters that go together most.
-        singular_values: of the scaled observation matrix; `rank` of them are kept.
+        robot: name of the robot, with its `base` and `tip` links.
+        joints: names of the joints; `prismatic` states which are prismatic.
+        metrics: content of ``metrics.json``.
+        parameters: all fitted parameters.
+        kept: arm parameters that kept their nominal values.
+        correlations: pairs of strongly correlated parameters.
+        correlated: correlation matrix of the most correlated parameters.
+        singular_values: singular values of the scaled observation matrix; `rank` of them are kept.
         sets: errors per set of rows.
-        noise: what the stated sigmas alone give, rms by nature [m, rad]; None where none were stated.
-        images: what each camera's images show of it; empty without any.
-        files: what was read, see `file_row`.
+        noise: nature -> rms that the stated σ alone cause [m, rad]; None if no σ was stated.
+        images: corner coverage of each camera's images; empty without images.
+        files: files that were read, see `file_row`.
         source: path of the robot's description.
     """
 
@@ -221,7 +221,7 @@ def _file_rows(inputs: Inputs) -> tuple[FileRow, ...]:
 def rows_of(name: str, comparison: Comparison, unseen: bool) -> RowErrors:
     """Return the errors of one set of rows, with joint values and target positions if each row has one error.
 
-    Of more than `MAX_ROWS` such rows a random sample, and the worst.
+    From more than `MAX_ROWS` such rows, a random sample and the worst row are taken.
     """
     sizes = comparison.errors[1].main
     if len(sizes) != sum(map(len, comparison.blocks)):
@@ -325,7 +325,7 @@ def read(path: Path) -> Report:
     """Read a fit's report from JSON.
 
     Raises:
-        UsageError: where it is missing or made by another version.
+        UsageError: if the file is missing or was written by another version.
     """
     schema = read_json(path, "fit again").get("schema")
     if schema not in READABLE_SCHEMAS:

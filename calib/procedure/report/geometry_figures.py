@@ -1,6 +1,6 @@
 """Figures of a geometric calibration, from a `Report` or from arrays [m, rad], as `Chart`s with captions.
 
-Before is light and after is dark, so that a greyscale print distinguishes them.
+Errors of the nominal arm are drawn light and those of the calibrated arm dark, distinguishable in greyscale.
 """
 
 from collections.abc import Sequence
@@ -28,13 +28,13 @@ BIN_EDGES = 31
 def error_histogram(
     before: np.ndarray, after: np.ndarray, nature: str = "position", noise: float | None = None, arm: str = ARM["urdf"]
 ) -> Chart:
-    """Return the histogram of errors before and after, each with its rms; `noise` marks the instrument's error.
+    """Return the histogram of nominal and calibrated errors, each with its rms; `noise` marks the instrument's error.
 
     Args:
-        before, after: (m,) [m] or [rad].
+        before, after: (m,) errors of the nominal and of the calibrated arm [m] or [rad].
         nature: ``position``, ``orientation`` or ``distance``.
-        noise: rms of the instrument's own error, in the same unit.
-        arm: whose errors `after` are, in a word or two.
+        noise: rms of the instrument's own error, in the unit of the errors; None: not drawn.
+        arm: name of the arm that `after` belongs to.
     """
     factor, unit = ERRORS[nature]
     before, after = factor * np.asarray(before), factor * np.asarray(after)
@@ -83,10 +83,10 @@ def residuals_by_joint(
     """Return the chart of errors over each joint value; a trend in the errors shows an unmodelled effect.
 
     Args:
-        q: (m, n) [rad or m].
-        before, after: (m,) sizes of errors [m] or [rad].
-        joint_names: (n,).
-        prismatic: (n,) which joints are.
+        q: (m, n) joint values [rad or m].
+        before, after: (m,) sizes of errors of the nominal and of the calibrated arm [m] or [rad].
+        joint_names: (n,) names of the joints.
+        prismatic: (n,) whether each joint is prismatic.
         nature, arm: as in `error_histogram`.
     """
     factor, unit = ERRORS[nature]
@@ -126,14 +126,14 @@ def error_map(
     expected: np.ndarray | None = None,
     least: float = 0.0,
 ) -> Chart:
-    """Return the maps of remaining errors in the workspace (from above and from the side) and of expected errors.
+    """Return the maps of calibrated errors in the workspace (from above and from the side), and of expected errors.
 
     Args:
         points: (m, 3) target positions in the arm's base [m].
-        sizes: (m,) errors that remain [m].
-        words: of the title, around the largest.
-        expected: (m,) radius within which 95 % of such errors are to be [m]; None or empty where it is not known.
-        least: where the colours begin [m].
+        sizes: (m,) errors of the calibrated arm [m].
+        words: title, with {} for the largest error.
+        expected: (m,) predicted radius that contains 95 % of such errors [m]; None or empty if unknown.
+        least: error at which the colour scale begins [m].
     """
     largest_mm = 1e3 * float(np.max(sizes, initial=1e-9))
     title = f"from above: {words.format(f'{largest_mm:.3g} mm')}"
@@ -193,12 +193,12 @@ def image_coverage(size: tuple[int, int], count: np.ndarray, rms: np.ndarray) ->
 
 
 def parameter_changes(rows: Sequence[FittedParameter], most: int = 48, of: str = "fitted - nominal") -> Chart:
-    """Return the chart of fitted minus nominal values with bars of two sigmas; lengths in mm, angles in mrad.
+    """Return the chart of fitted minus nominal values with bars of two σ; lengths in mm, angles in mrad.
 
     Args:
-        rows: fitted parameters; those in other units are left out.
-        most: parameters per panel, those furthest from nominal by their sigma.
-        of: of what the difference is, in words.
+        rows: fitted parameters; those in other units are omitted.
+        most: largest number of parameters per panel, those furthest from nominal in σ.
+        of: text for the difference that is drawn.
     """
     panels = []
     longest = 5
@@ -225,8 +225,8 @@ def singular_values(values: np.ndarray, rank: int) -> Chart:
     """Return the chart of singular values of the scaled observation matrix, and of the gap below the identifiable ones.
 
     Args:
-        values: (p,), falling.
-        rank: how many are kept.
+        values: (p,) singular values in descending order.
+        rank: number of values that are kept.
     """
     values = np.asarray(values, dtype=float)
     # zeros have no place on a logarithmic axis
@@ -299,8 +299,9 @@ def outlook_figure(others: Curve, own: tuple[float, float], along: str, across: 
     """Return the chart of predicted σ over measuring effort, both logarithmic; the present plan is marked.
 
     Args:
-        others: pairs of effort and sigma; own: the same of the plan.
-        along, across: what they are, with units.
+        others: pairs of effort and σ.
+        own: effort and σ of the present plan.
+        along, across: labels of effort and σ, with units.
     """
     points = np.array(sorted(others)).reshape(-1, 2)
     with_plan = np.vstack([points, [own]])

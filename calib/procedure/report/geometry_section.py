@@ -47,7 +47,7 @@ ALONE_NOTE = (
 
 
 def read_lines(inputs: Inputs) -> list[str]:
-    """Return lines on the robot and the measurements, as read."""
+    """Return text lines on the robot and the measurements, as read."""
     chain = inputs.chain
     lines = [f"robot {chain.name}: {chain.n} joints, {chain.base} to {chain.tip}"]
     for block in inputs.fit:
@@ -86,7 +86,8 @@ def report_section(report: Report, figures: Mapping[str, page.Picture]) -> page.
     """Return the section of a report: errors, ladder, parameters, identifiability, figures, outliers.
 
     Args:
-        figures: by name (`geometry_figures.captioned`); missing ones are left out.
+        report: report of the fit.
+        figures: figures by name (`geometry_figures.captioned`); missing ones are omitted.
     """
     metrics = report.metrics
     blocks: list[page.Block] = [error_table(_sets(metrics), metrics.deliverable), *iso9283_tables(metrics)]
@@ -107,9 +108,11 @@ def report_section(report: Report, figures: Mapping[str, page.Picture]) -> page.
 
 
 def _key_figures(report: Report) -> list[page.KeyFigure]:
-    """Return the errors that decide the verdict, before and after calibration.
+    """Return the errors of nominal and calibrated robot that decide the verdict.
 
-    Of the worst unseen rows; without any, those of cross-validation, where it judged; else of the fit's rows.
+    They are those of the worst unseen rows; without unseen rows, those of cross-validation if the verdict is based on
+    it;
+    else those of the fitted rows.
     """
     metrics = report.metrics
     if not metrics.proofs:
@@ -172,7 +175,9 @@ def _rms_spread(rows: RowErrors | None, arm: str, nature: str) -> str:
 
 
 def deciding(report: Report) -> tuple[ComparedRows, RowErrors | None]:
-    """Return the worst unseen rows, and the errors of each; without unseen ones the fit's rows."""
+    """Return the worst unseen rows with the error of each row (None if not stored); without unseen rows, the fitted
+    ones.
+    """
     metrics = report.metrics
     name = next(iter(metrics.proofs), "fit")
     largest = -np.inf
@@ -226,12 +231,12 @@ def _sets(metrics: FitMetrics) -> list[tuple[str, ComparedRows]]:
 
 
 def meanings(rows: ComparedRows) -> list[str]:
-    """Return what the position errors of rows are, in sentences; none where positions were measured."""
+    """Return sentences on the meaning of the position errors of rows; [] if positions were measured."""
     return [sentence for name, sentence in MEANS.items() if name in rows.position_means]
 
 
 def error_table(sets: Sequence[tuple[str, ComparedRows]], deliverable: str) -> page.ReportTable:
-    """Return the table of errors of all arms on sets of rows, with the one that is judged in bold."""
+    """Return the table of errors of all arms on sets of rows, with the arm that the verdict is about in bold."""
     has_corrections = any(rows.urdf_alone for _, rows in sets)
     notes = {"Distances of pairs do not depend on the placement of instrument and tool.": None}
     if has_corrections:
@@ -322,7 +327,9 @@ def error_words(metrics: FitMetrics) -> str:
 
 
 def _rms_words(rows: ComparedRows, deliverable: str) -> str:
-    """Return the rms errors of the nominal robot and of what is delivered; in brackets those of the alternative."""
+    """Return the rms errors of the nominal robot and of the deliverable as text; those of the alternative in
+    brackets.
+    """
     arms = {"nominal": rows.nominal, ARM["urdf"]: rows.calibrated}
     alternative = {}
     if rows.urdf_alone is not None:
@@ -405,7 +412,7 @@ def _repeated_sentences(metrics: FitMetrics) -> list[str]:
 
 
 def iso9283_words(rows: ComparedRows) -> str:
-    """Return the sentence on repeated poses, naming the arm; empty where no pose was repeated."""
+    """Return the sentence on repeated poses, naming the arm; empty if no pose was repeated."""
     if rows.iso9283 is None:
         return ""
     return iso9283_sentence(rows.iso9283, ARM["corrections"] if rows.urdf_alone else ARM["urdf"])

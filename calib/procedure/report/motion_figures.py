@@ -36,9 +36,9 @@ def motion_sheet(times: np.ndarray, series: Sequence[Limited], joints: Sequence[
     """Return the chart of series of every joint, a row per joint and a column per series, limits dashed.
 
     Args:
-        times: (N,) [s].
-        series: values (N, n), lower and upper limit (n,), infinite without one: q, v, and a and τ where known.
-        joints: of the robot (n).
+        times: (N,) times [s].
+        series: values (N, n), lower and upper limits (n,), infinite without one, of q, v, and of a and τ if known.
+        joints: the robot's n joints.
     """
     units = motion_units(joint.kind for joint in joints)
     panels = []

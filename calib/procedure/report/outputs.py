@@ -1,4 +1,4 @@
-"""What the folder of a result holds besides its numbers: the data of its report, figures, and its certificate."""
+"""Additional files of a result's folder: data of its report, figures, and its certificate."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def write_fit(outcome: Outcome, folder: Path, plots: bool = True, pages: bool = 
 def write_model(outcome: IdentificationOutcome, folder: Path, plots: bool = True, pages: bool = True) -> None:
     """Write the figure of friction (if `plots`) and, outside sessions, ``report.json``, figures and certificate.
 
-    A session's certificate draws the other figures, with the unseen recordings.
+    In a session, the certificate draws the other figures, with the unseen recordings.
     """
     from calib.procedure.dynamic_stage.folder import UnseenFolder
     from calib.procedure.report import dynamics_section

@@ -26,11 +26,12 @@ class ReportTable:
     """Table of a report: rows of text under a header.
 
     Attributes:
+        title: title of the table.
         header: names of the columns.
-        rows: cells; a row of one cell is a heading over the rows that follow.
-        note: how to read it.
-        strong: numbers of the rows to set in bold.
-        numbers: columns to set to the right.
+        rows: cells of each row; a row of one cell is a heading over the rows that follow.
+        note: explanation for the reader.
+        strong: indices of the rows in bold.
+        numbers: indices of the right-aligned columns.
     """
 
     title: str
@@ -113,7 +114,7 @@ def shortened(text: str, max_letters: int) -> str:
 
 @dataclass(frozen=True)
 class Text:
-    """A list of sentences; on the console, `label` is printed before each, or that it is a warning."""
+    """A list of sentences; on the console each is printed with `label` in front, or marked as a warning."""
 
     title: str
     lines: Sequence[str | Note]
@@ -126,7 +127,9 @@ class Text:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure as PNG or SVG; a wide one uses the full width of the page; `chart` is what it was drawn from."""
+    """A figure as PNG or SVG; a wide one uses the full width of the page; `chart` is the chart it shows; None:
+    unknown.
+    """
 
     image: bytes
     caption: str
@@ -159,12 +162,12 @@ class KeyFigure:
     """A number on which a verdict is based.
 
     Attributes:
-        quantity: what it is.
-        before, after: of the nominal and of the calibrated robot, with unit.
+        quantity: name of the quantity.
+        before, after: its value for the nominal and for the calibrated robot, with unit.
         spread: its standard error.
-        basis: on how many poses or motions, unseen or not.
-        allowed: the tolerance; empty where none was given.
-        met: whether it is met, in a word.
+        basis: number of poses or motions it was computed from, and whether they are unseen.
+        allowed: the tolerance; empty without one.
+        met: whether the tolerance is met, as text.
     """
 
     quantity: str

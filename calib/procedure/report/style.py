@@ -89,9 +89,9 @@ def sheet(
     """Return a matplotlib figure without a window, and its axes row by row.
 
     Args:
-        rows, columns: of axes.
-        width, height: of the figure [in].
-        head: what is kept free at the top for `legend` [in].
+        rows, columns: numbers of rows and columns of axes.
+        width, height: size of the figure [in].
+        head: height kept free at the top for `legend` [in].
     """
     drawn_part = (0.0, 0.0, 1.0, 1.0 - head / height)
     layout = ConstrainedLayoutEngine(rect=drawn_part, w_pad=0.04, h_pad=0.04, wspace=0.0, hspace=0.0)
@@ -147,11 +147,12 @@ def legend(figure: Figure, axes: Axes | None, title: str) -> None:
 
 
 def thinned(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a long curve reduced to the minimum and maximum of each of `STRETCHES`; all peaks are kept.
+    """Return a long curve reduced to the minimum and maximum of each of `STRETCHES` intervals, so that all peaks are
+    kept.
 
     Args:
-        t: (N,) [s].
-        values: (N,).
+        t: (N,) times [s].
+        values: (N,) values.
     """
     size = len(t) // STRETCHES
     if size < 3:

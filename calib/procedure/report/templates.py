@@ -1,4 +1,4 @@
-"""Pages from templates in one style, and what all of them state: when they were made, and by which version."""
+"""Pages from templates in a common style, with the date and the versions that all of them state."""
 
 from __future__ import annotations
 

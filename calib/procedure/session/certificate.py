@@ -142,7 +142,7 @@ def _validated_report(session: Session) -> fit_report.Report:
 
 
 def _unchecked(session: Session) -> Iterator[str]:
-    """Yield what the whole session does not show."""
+    """Yield texts on what the whole session cannot prove."""
     unchecked = _session_plan(session).unchecked if session.geometric else ()
     if unchecked:
         yield f"when poses were chosen: {', '.join(unchecked)}"
@@ -179,7 +179,7 @@ def _with_arrival(stage: StageRecord, lines: list[str]) -> StageRecord:
 
 
 def _setup(session: Session, metrics: FitMetrics | None) -> list[Entry]:
-    """Return what was calibrated, with what and how, for the stages that the session has."""
+    """Return the entries on robot, instrument and method, for the stages that the session has."""
     settings, chain = session.settings, chain_of(session)
     description = settings.robot.given
     if metrics is None:

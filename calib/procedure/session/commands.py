@@ -220,25 +220,26 @@ def new_session(
     """Create the folder of a guided session for a robot, like `calib new`.
 
     Args:
-        folder: new.
+        folder: new folder.
         robot, base, tip: as of `calib.load`.
         instrument: ``cmm``, ``tracker``, ``tracker6d``, ``mocap``, ``camera``, ``other-pose``, ``other-position``, or
-            ``none``: dynamics alone, the robot's description taken as calibrated.
-        poses, validation: how many to choose for the fit, and to measure and never fit.
-        tool: (3,) where the target roughly sits in the tip's frame [m].
-        limits: TOML file that both poses and motions keep (``calib formats limits``), or its tables.
-        dynamics: identify the dynamics, too.
-        seed: of everything random.
-        program: controller in whose language the poses are written, too (`calib program --list`).
+            ``none``: identify the dynamics only, on the geometry of the robot's description.
+        poses, validation: number of poses to choose for the fit, and of poses to measure for validation only.
+        tool: (3,) approximate position of the target in the tip's frame [m]; None: the tip.
+        limits: TOML file of limits for both poses and motions (``calib formats limits``), or its tables; None:
+            defaults.
+        dynamics: whether to identify the dynamics, too.
+        seed: seed of all random numbers.
+        program: controller in whose language the poses are written, too (`calib program --list`); empty: none.
         tolerance_mm: largest accepted rms on unseen poses [mm]; 0: none.
-        certificate: keys of ``[certificate]``: what the certificate states besides results.
+        certificate: keys of ``[certificate]``: entries of the certificate besides results.
         motion: other keys of ``[dynamics]`` (``calib formats session``): torques, payloads, period …
 
     Returns:
-        The folder; its ``session.toml`` says how the session goes on.
+        The folder; its ``session.toml`` states the settings of the session.
 
     Raises:
-        UsageError: where the folder is in use, or a value is none of these.
+        UsageError: if the folder is in use, or a value is not valid.
     """
     stage_of(robot, "a guided session")
     device, source = instrument_named(instrument), resolve(robot)
@@ -292,11 +293,11 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", 
     """Run all steps whose inputs exist, and return the step that waits for input, with instructions.
 
     Args:
-        folder: of the session.
-        say, progress: lines that stay, and words that pass.
-        command: for the record.
-        again: name of a step to make again, with all that rests on it.
-        plots: whether figures are drawn.
+        folder: folder of the session.
+        say, progress: functions that print permanent lines, and progress messages.
+        command: name of the command for the record.
+        again: name of a step to repeat, with all steps that depend on it; empty: none.
+        plots: whether to draw figures.
     """
     session = open_session(folder, plots)
     with locked(session, say):

@@ -61,13 +61,14 @@ class Trend:
 
     Attributes:
         what: name of the column.
-        unit: of it, as shown: h or °C.
-        x: (m,) time from the start or temperature of the visits to repeated poses, in that unit.
-        moved: (m, 3) their points, less the arm's prediction and their poses' mean [m], in the instrument's frame.
-        poses: repeated poses.
-        span: of the column over all rows.
-        slope, sigma: (3,) of the target, and its standard deviation per axis [m per unit].
-        sigmas: deviation of a normal variable that is as unlikely as so large a slope without drift.
+        unit: its unit as shown: h or °C.
+        x: (m,) time from the start, or temperature, of the measurements of repeated poses [unit].
+        moved: (m, 3) measured points minus the arm's prediction and minus each pose's mean [m], in the instrument's
+            frame.
+        poses: number of repeated poses.
+        span: range of the column over all rows [unit].
+        slope, sigma: (3,) rate of the target's motion, and its standard deviation per axis [m per unit].
+        sigmas: significance of the slope, as the deviation of a normal variable with the same probability.
     """
 
     what: str
@@ -87,11 +88,11 @@ class Trend:
 
     @property
     def total(self) -> float:
-        """Way of the target over all rows [m]."""
+        """Distance that the target moves over all rows [m]."""
         return self.size * self.span
 
     def finding(self, need: float) -> Finding:
-        """Return the finding on this trend; `need`: the way that would matter [m], 0: unknown."""
+        """Return the finding on this trend; `need`: smallest relevant distance [m], 0: unknown."""
         rate = f"{1e3 * self.size:.2g} ± {1e3 * self.sigma:.1g} mm/{self.unit}"
         times = self.total / need if need else 0.0
         return finding("target-drifts", sigmas=self.sigmas, times=times, rate=rate, total=self.total, column=self.what)
@@ -105,7 +106,7 @@ def noise_of_difference(sigma: float) -> float:
 def of_session(
     session: Session, chain: Chain, blocks: Sequence[PoseMeasurements], again: Sequence[PoseMeasurements]
 ) -> list[Finding]:
-    """Return what a session says of drift when its measurements have arrived."""
+    """Return the findings on drift from a session's measurements, when they arrive."""
     sigma, tolerance = session.settings.instrument.sigma_position, 1e-3 * session.settings.fit.tolerance_mm
     trended = [one.finding(tolerance or noise_of_difference(sigma)) for one in trends(chain, blocks, again, sigma)]
     return [*repeats(chain, blocks, again, sigma), *trended]
@@ -118,9 +119,9 @@ def repeats(
 
     Args:
         chain: the nominal arm.
-        blocks: measured for the fit.
-        again: files whose name starts with drift.
-        sigma: of one position, per axis [m]; 0: not known, then only the figure is given.
+        blocks: measurements for the fit.
+        again: measurements of files whose name starts with drift.
+        sigma: σ of one position, per axis [m]; 0: unknown, then the drift is stated without a judgement.
     """
     pairs = [(later.file, "again at the end", drift_of(chain, later, blocks)) for later in again]
     pairs += [(block.file, "more than once", drift_of(chain, block)) for block in blocks]
@@ -146,7 +147,7 @@ def drift_of(chain: Chain, later: PoseMeasurements, first: Sequence[PoseMeasurem
     Args:
         chain: the nominal arm.
         later: measured poses or positions; other kinds are ignored.
-        first: the earlier ones; None for earlier rows of `later`.
+        first: the earlier measurements; None: the earlier rows of `later`.
     """
     before = [later] if first is None else first
     earlier = [(block, k) for block in before if isinstance(block, Positions) for k in range(len(block))]
@@ -168,14 +169,14 @@ def drift_of(chain: Chain, later: PoseMeasurements, first: Sequence[PoseMeasurem
 def trends(
     chain: Chain, blocks: Sequence[PoseMeasurements], again: Sequence[PoseMeasurements] = (), sigma: float = 0.0
 ) -> list[Trend]:
-    """Return the target's motion with time and with each temperature that the files state; empty without repeats.
+    """Return the target's motion with time and with each temperature that the files state; [] without repeated poses.
 
     Args:
         chain: the nominal arm.
-        blocks: measured poses or positions; other kinds are ignored. A time counts if all files are of one clock: they
-            do not overlap.
-        again: measured from where the first block was.
-        sigma: of one position, per axis [m]; 0: not known. The σ of a slope rests on at least that.
+        blocks: measured poses or positions; other kinds are ignored. Times are used if all files have a common clock,
+            that is, do not overlap.
+        again: measurements at the end, from the station of the first block.
+        sigma: σ of one position, per axis [m], a lower limit for the noise; 0: unknown.
     """
     seen = [block for block in blocks if isinstance(block, Positions)]
     seen += [replace(block, station=seen[0].station) for block in again if seen and isinstance(block, Positions)]

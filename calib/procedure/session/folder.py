@@ -179,7 +179,7 @@ class Session:
 
     @property
     def needs(self) -> bool:
-        """Whether the session says how well torques or parameters have to be known."""
+        """Whether the session requests an accuracy of torques or parameters."""
         section = self.settings.dynamics
         return self.dynamic and section.plan and bool(section.tolerance_percent or section.sigma_percent)
 
@@ -210,7 +210,7 @@ class Session:
 
     @property
     def concluded(self) -> bool:
-        """Whether the session has come to a verdict."""
+        """Whether the session has a verdict."""
         return self.path(VERDICT).exists()
 
     def write_state(self, state: StateFile) -> None:

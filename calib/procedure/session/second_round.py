@@ -1,14 +1,13 @@
-"""A further motion, where joints or parameters fall short of what ``session.toml`` asks for.
+"""A further motion, for joints or parameters that do not meet the accuracy requested in ``session.toml``.
 
-Where the session states no need, its end says which joints' torques and which essential parameters' σ are above `NEED`,
-and how to have a motion designed for them. Else asked are
-``tolerance_percent``, of the torques on unseen motion, and ``sigma_percent``, of essential parameters. The
+Requests are ``tolerance_percent``, of the torques on unseen motion, and ``sigma_percent``, of essential parameters. The
 motion is designed after the identification, into ``6-excitation/round2`` (``round3`` once round2 was recorded …); a log
-whose name begins like that folder is identified together with all others.
+whose name begins with the folder's name is identified together with all others. If the session requests nothing, its
+last messages name the joints' torques and the essential parameters' σ above `NEED`, and how to have a motion designed.
 
-More motion lowers the error of a joint's torque only by the part that the parameters' σ has in it: of an error e with
-the parts s before and s' after the motion, √(e² - s² + s'²) remains. Where even s' = 0 would gain less than `MIN_GAIN`,
-more motion does not help: what is left is not modelled.
+More motion reduces the error of a joint's torque only by the part that comes from the parameters' σ: of an error e with
+the parts s before and s' after the motion, √(e² - s² + s'²) remains. If even s' = 0 would gain less than `MIN_GAIN`,
+more motion does not help: the remaining error is not modelled.
 """
 
 from dataclasses import replace
@@ -49,21 +48,25 @@ class _Parameter(NamedTuple):
 
 
 class _ShortParameter(NamedTuple):
-    """A joint whose torque is worse than asked for: index, error on unseen motion [%], torque rms [N m or N]."""
+    """A joint whose torque error is larger than requested: index, error on unseen motion [%], torque rms [N m or N]."""
 
     joint: int
     error: float
     size: float
 
     def left(self, before: np.ndarray, after: np.ndarray) -> float:
-        """Return the error [%] that remains once the torques' σ (n,) by the parameters has fallen."""
+        """Return the error [%] that remains after the torques' σ (n,) from the parameters falls from `before` to
+        `after`.
+        """
         then = 100.0 * before[self.joint] / self.size
         after_percent = 100.0 * after[self.joint] / self.size
         return float(np.sqrt(max(self.error**2 - then**2 + after_percent**2, 0.0)))
 
 
 def extend(session: Session, say: Say) -> list[str]:
-    """Design a further motion where joints or parameters fall short, and return what it will bring as notes."""
+    """Design a further motion if joints or parameters do not meet the request; return its predicted benefit as
+    notes.
+    """
     section = session.settings.dynamics
     identification = session.identification
     round_name = next_round(session)
@@ -116,7 +119,7 @@ def extend(session: Session, say: Say) -> list[str]:
 
 
 def _short_joints(session: Session, tolerance: float) -> list[_ShortParameter]:
-    """Return the joints whose motor torque is worse than tolerated [%], where the torques together are."""
+    """Return the joints whose motor torque error exceeds the tolerance [%], if that of all torques together does."""
     report = session.identification.unseen.read()
     recordings = (report.proofs or report.fit).values()
     worst = max(recordings, key=lambda recording: recording.raw.relative_error_percent.total).raw
@@ -135,7 +138,7 @@ def _short_joints(session: Session, tolerance: float) -> list[_ShortParameter]:
 
 
 def _weak_parameters(session: Session, tolerance: float) -> tuple[str, ...]:
-    """Return the essential parameters whose relative σ [%] is above the one asked for, and that a design can aim at."""
+    """Return the essential parameters whose relative σ [%] exceeds the tolerance, and that a design can aim at."""
     identification = session.identification
     without = {column.name for column in identification.dynamics().model.columns if not column.form.slopes}
     weak = []
@@ -147,7 +150,7 @@ def _weak_parameters(session: Session, tolerance: float) -> tuple[str, ...]:
 
 
 def _unmodelled(inputs: ExcitationInputs, joints: list[_ShortParameter]) -> list[str]:
-    """Return a note on the joints that more motion does not help."""
+    """Return a note on the joints whose torque error more motion does not reduce; [] if there are none."""
     if not joints:
         return []
     names = listing(f"{inputs.chain.joint_names[joint.joint]} {joint.error:.2g} %" for joint in joints)
@@ -155,7 +158,7 @@ def _unmodelled(inputs: ExcitationInputs, joints: list[_ShortParameter]) -> list
 
 
 def _gains(designed: design.Designed, joints: list[_ShortParameter], parameters: tuple[str, ...]) -> list[str]:
-    """Return a note on what a motion will bring to joints and parameters, the worst first."""
+    """Return a note on the predicted improvement of joints and parameters by a motion, the worst first."""
     outlook = designed.outlook
     names = designed.inputs.chain.joint_names
     rows = sorted(designed.predicted, key=lambda prediction: -(prediction.rsd or 0.0))
@@ -175,9 +178,9 @@ def _gains(designed: design.Designed, joints: list[_ShortParameter], parameters:
 
 
 def promised(session: Session) -> tuple[str, ...]:
-    """Return what a further motion will bring to a complete session, and how to carry it out; empty without one.
+    """Return lines on a further motion of a complete session: its benefit, and how to record it; () without one.
 
-    Of a session that states no need: what falls short of the default ones.
+    If the session requests no accuracy, the lines name joints and parameters that do not meet the default.
     """
     if session.dynamic and session.settings.dynamics.plan and not session.needs:
         return _short_of_default(session)

@@ -1,4 +1,4 @@
-"""Sessions by their folders, and what one that is done came to: errors before and after, in one number each."""
+"""Folders of sessions, and errors of complete sessions, each as one number for nominal and calibrated robot."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -8,7 +8,7 @@ from calib.procedure.session.folder import SETTINGS, Session
 
 
 def _on_this_machine(address: str) -> list[str]:
-    """Return no addresses: a path on this machine names one folder."""
+    """Return no addresses, since a path on this machine names a single folder."""
     return []
 
 

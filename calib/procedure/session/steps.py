@@ -41,11 +41,12 @@ DONE, READY, WAITING, STALE, KEPT, AFTER = "done", "ready", "waiting", "stale", 
 
 @dataclass(frozen=True)
 class SessionFile:
-    """A file that a step reads, by its name in the session's folder; none in sessions without the file's stage.
+    """A file that a step reads, by its name in the session's folder; absent if the session lacks the file's stage.
 
     Attributes:
+        name: name of the file.
         optional: whether it may be missing.
-        without_geometry: whether it is read only where no geometry is fitted.
+        without_geometry: whether it is read only if no geometry is fitted.
     """
 
     name: str
@@ -129,14 +130,16 @@ class SessionStep:
     """A step of a session: inputs, outputs, settings and function.
 
     Attributes:
-        name, purpose: for people.
-        make: runs it; returns what is to be said.
-        reads: the files it reads.
-        makes: names or patterns of what it makes.
-        settings: what it depends on in ``session.toml``.
-        stage: ``geometry`` or ``dynamics``, where only sessions with that have it; ``need``: those that state one.
-        brings: what people bring before it, and in words.
-        kept: what it is not made again for, once that is brought, and in words; empty: always made again.
+        name, purpose: name, and purpose as text for the user.
+        make: function that runs the step and returns its notes.
+        reads: files that it reads.
+        makes: names or patterns of the files that it writes.
+        settings: sections and keys of ``session.toml`` that it depends on.
+        stage: ``geometry`` or ``dynamics`` if only sessions with this stage have the step; ``need`` if only sessions
+            that
+            request an accuracy have it; empty: all sessions.
+        brings: kind of files that the user provides before the step, and their description.
+        kept: kind of files after whose arrival the step is not repeated, and their description; empty: always repeated.
     """
 
     name: str
@@ -382,7 +385,7 @@ def states(session: Session) -> list[State]:
 
 
 def _state(session: Session, step: SessionStep, recorded: StateFile) -> State:
-    """Return the status of a step before which all are done."""
+    """Return the status of a step whose predecessors are all done."""
     missing = _missing(session, step)
     if missing:
         return State(step, WAITING, missing)

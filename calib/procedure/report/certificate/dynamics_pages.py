@@ -1,4 +1,4 @@
-"""The certificate's page on the dynamics: torque errors in N·m and of the limits, torques, uncertainty."""
+"""Page of the certificate on the dynamics: torque errors in N·m and as shares of the limits, torques, uncertainty."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ NOTE = (
 
 
 def stage(report: DynamicReport, section: Section, plots: bool, tolerance: float = 0.0) -> StageRecord:
-    """Return the stage of an identification.
+    """Return the record of an identification for report and certificate.
 
     Args:
-        report: of the identification.
-        section: of the report, with verdict and key figures.
-        plots: whether there are to be figures.
-        tolerance: largest error of the torque on unseen motion that is good enough [%]; 0: none.
+        report: report of the identification.
+        section: section of the report, with verdict and key figures.
+        plots: whether to include figures.
+        tolerance: largest acceptable torque error on unseen motion [%]; 0: no tolerance.
     """
     order = _worst_first(report)
     pictures = list(_curves(report, order)) if plots else []
@@ -57,7 +57,7 @@ def stage(report: DynamicReport, section: Section, plots: bool, tolerance: float
 
 
 def _unchecked(report: DynamicReport, tolerance: float) -> Iterator[str]:
-    """Yield what the recordings of an identification do not show."""
+    """Yield texts on what the recordings of an identification cannot prove."""
     if not report.unseen.proofs:
         yield "torque errors on unseen motion: none was recorded"
     if not tolerance:
@@ -69,7 +69,10 @@ def _uncertainty_findings(report: DynamicReport) -> list[str]:
 
 
 def _worst_first(report: DynamicReport) -> np.ndarray:
-    """Return the torque rows by their error, as a share of the limit if all limits are known, else of the largest."""
+    """Return the indices of the torque rows, sorted by error, worst first.
+
+    Errors are taken as shares of the torque limits if all limits are known, else in absolute terms.
+    """
     _, proof, _ = proof_of(report.unseen)
     errors = np.nan_to_num(proof.raw.rms)
     limits = report.unseen.limits
@@ -153,7 +156,9 @@ class _LimitMargin:
 
 @dataclass(frozen=True)
 class _DesignMetrics:
-    """What is read of the ``metrics.json`` of a designed motion: condition number, settings, smallest margins."""
+    """Entries of a designed motion's ``metrics.json`` that the certificate uses: condition number, settings,
+    margins.
+    """
 
     condition_number: Mapping[str, float]
     setting: _DesignSetting

@@ -32,10 +32,11 @@ NO_ISO = (
 
 
 def stage(report: Report, drawn: Mapping[str, Picture]) -> StageRecord:
-    """Return the stage of a fit.
+    """Return the record of a fit for report and certificate.
 
     Args:
-        drawn: figures of the report by name; without any the certificate has none either.
+        report: report of the fit.
+        drawn: figures of the report by name; empty: the certificate has no figures either.
     """
     blocks = list(_blocks(report, bool(drawn)))
     # what stands under uncertainty is not repeated among the findings
@@ -63,7 +64,7 @@ def _blocks(report: Report, plots: bool) -> Iterator[Block]:
 
 
 def _unchecked(report: Report) -> Iterator[str]:
-    """Yield what the measurements of a fit do not show."""
+    """Yield texts on what the measurements of a fit cannot prove."""
     metrics = report.metrics
     if not metrics.proofs:
         yield "errors on held-out poses: none were measured"
@@ -78,7 +79,9 @@ def _uncertainty_findings(metrics: FitMetrics) -> list[str]:
 
 
 def _figures(report: Report, row_errors: RowErrors, label: str) -> Iterator[Picture]:
-    """Yield the histograms of errors before and after, and the map of what remains with the worst pose marked."""
+    """Yield the histograms of nominal and calibrated errors, and the map of calibrated errors with the worst pose
+    marked.
+    """
     from calib.procedure.report.charts import text, vector
     from calib.procedure.report.geometry_figures import error_histogram, error_map
     from calib.procedure.report.style import MARK

@@ -1,8 +1,7 @@
-"""What a certificate and a report say, as records; `calib.procedure.report.certificate.rendering` makes HTML and PDF
-of them.
+"""Contents of a certificate and a report as records; `calib.procedure.report.certificate.rendering` renders them.
 
-Every word is in the record, so that HTML and PDF say the same. A certificate has at most `MAX_PAGES` pages: lists and
-texts that have no bound of their own are cut at a stated number here, and the report has the whole.
+The records contain every word, so that HTML and PDF have the same text. A certificate has at most `MAX_PAGES` pages:
+lists and texts of unlimited length are cut here at a stated number, and the report contains them completely.
 """
 
 from __future__ import annotations
@@ -67,7 +66,7 @@ NOTES = (Text("Limitations", LIMITATIONS), Text("Conventions", CONVENTIONS))
 
 @dataclass(frozen=True)
 class Entry:
-    """A line of a certificate: what it is, and its value; an empty one is a line to fill in by hand."""
+    """A line of a certificate: label and value; an empty value is a line to fill in by hand."""
 
     label: str
     value: str = ""
@@ -75,7 +74,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Page:
-    """A report: title, origin, and sections; the judged ones have a verdict."""
+    """A report: kind, title, subtitle, date of issue, and sections; sections of a stage have a verdict."""
 
     kind: str
     title: str
@@ -86,7 +85,7 @@ class Page:
 
 @dataclass(frozen=True)
 class Judgement:
-    """A verdict: on what, its level and the label for it, and the reason as a sentence."""
+    """A verdict: title of its subject, level, label of the level, and the reason as a sentence."""
 
     title: str
     level: str
@@ -99,14 +98,14 @@ class Certificate(Page):
     """A certificate.
 
     Attributes:
-        number: its number.
-        alert: what has to be known first: that it is simulated.
-        verdicts: one of each stage.
-        tolerances: tolerance asked and met, for each quantity and deliverable.
-        setup: what the data say of robot, instrument and method.
-        details: what a person says beside that, and lines to fill in.
-        signatures: who signs, and what else is written there.
-        sections: one a page, with the blocks of the certificate.
+        number: number of the certificate.
+        alert: warning at the top, such as that the results are simulated; empty without one.
+        verdicts: verdict on each stage.
+        tolerances: requested tolerance and whether it is met, for each quantity and deliverable.
+        setup: robot, instrument and method, as stated by the results.
+        details: entries by a person, and lines to fill in.
+        signatures: labels of the signature fields.
+        sections: pages of the certificate, one per section.
     """
 
     number: Entry
@@ -123,10 +122,10 @@ class StageRecord:
     """A stage of a calibration, as report and certificate show it.
 
     Attributes:
-        section: of the report, with verdict and key figures.
-        sheet: blocks of the certificate's page on it.
-        unchecked: what the data do not show.
-        findings: what was noticed.
+        section: section of the report, with verdict and key figures.
+        sheet: blocks of the certificate's page on the stage.
+        unchecked: texts on what the measurements cannot prove.
+        findings: texts of the findings.
     """
 
     section: Section
@@ -148,11 +147,13 @@ def records(
     """Return certificate and report of a calibration.
 
     Args:
-        setup: what was calibrated, with what and how; the certificate states `CERTIFIED_SETUP` of it.
-        unchecked: what was not checked besides what the stages say.
-        files: what it rests on, see `calib.procedure.report.fit_report.file_row`; the most important ones first.
-        details: what a person says beside the data.
-        alert: what has to be known first.
+        title, subtitle: of both documents.
+        setup: robot, instrument and method; the certificate contains the entries of `CERTIFIED_SETUP`.
+        stages: records of the stages.
+        unchecked: what was not checked in addition to the stages' lists.
+        files: input files, see `calib.procedure.report.fit_report.file_row`; the most important ones first.
+        details: entries by a person.
+        alert: warning at the top; empty without one.
     """
     certified = []
     for entry in setup:
@@ -194,7 +195,7 @@ def records(
 
 
 def _certificate_page(title: str, blocks: Sequence[Block]) -> Section:
-    """Return a page of a certificate, its texts cut."""
+    """Return a page of a certificate, with its texts shortened."""
     return Section(title, [_cut(block) if isinstance(block, Text) else block for block in blocks])
 
 
@@ -212,7 +213,7 @@ def judgement(section: Section, max_letters: int | None = None) -> Judgement:
 
 
 def key_table(sections: Sequence[Section]) -> ReportTable:
-    """Return the table of what verdicts rest on: before, after, tolerance asked, and whether it is met."""
+    """Return the table of key figures: nominal, calibrated, requested tolerance, and whether it is met."""
     header = ("quantity", "nominal", "after", "standard error", "on", "tolerance asked", "met")
     rows, with_tolerance = [], set()
     for section in sections:
@@ -231,7 +232,9 @@ def _cells(figure: KeyFigure) -> tuple[str, ...]:
 
 
 def _cut(block: Text) -> Text:
-    """Return a text of a certificate with at most `MAX_LINES` sentences of `MAX_LINE` letters; the report has all."""
+    """Return a text of a certificate with at most `MAX_LINES` sentences of `MAX_LINE` letters; the report is
+    complete.
+    """
     lines = [shortened(_local(str(line)), MAX_LINE) for line in block.lines]
     if len(lines) > MAX_LINES:
         count = len(lines) - MAX_LINES + 1
@@ -240,12 +243,15 @@ def _cut(block: Text) -> Text:
 
 
 def _local(text: str) -> str:
-    """Return a text in which files are named without the folders of this machine."""
+    """Return a text with file names instead of absolute paths of this machine."""
     return re.sub(r"(?<![\w.~/])/(?:[^/\s]+/)+(?=[^/\s])", "", text)
 
 
 def files_table(files: Sequence[FileRow], max_files: int | None = None) -> ReportTable:
-    """Return the table of files with their SHA-256; of at most `max_files`, edited ones first, with short digests."""
+    """Return the table of files with their SHA-256.
+
+    With `max_files`, only so many files, those edited by hand first, with short digests; None: all.
+    """
     if max_files is None:
         return ReportTable("", ("file", "what it is", "bytes", "SHA-256"), files, numbers=(2,))
     # what was edited by hand is not hidden among the others

@@ -1,7 +1,7 @@
-"""Certificates and reports as HTML (one file that loads nothing) and as PDF (PDF/A-2b, by Typst).
+"""Certificates and reports as HTML (one file without external resources) and as PDF (PDF/A-2b, by Typst).
 
-The templates place what the records say, and add no words. The PDF's font is the one that comes with matplotlib; the
-computer's own fonts are looked through only for letters that it lacks.
+The templates only arrange the texts of the records. The PDF's font is the one delivered with matplotlib; the computer's
+own fonts are used only for letters that it lacks.
 """
 
 import json
@@ -28,7 +28,7 @@ STANDARD = "a-2b"
 
 
 def write(folder: Path, certificate: Certificate, report: Page) -> list[str]:
-    """Write a certificate as HTML and PDF and the report into a folder; return what there is to say."""
+    """Write a certificate as HTML and PDF and the report into a folder; return notes for the user."""
     document, notes = pdf(certificate)
     for name, content in zip(PAGES, (html(certificate), document, html(report))):
         if content:
@@ -39,7 +39,7 @@ def write(folder: Path, certificate: Certificate, report: Page) -> list[str]:
 
 
 def write_figures(folder: Path, page: Page) -> int:
-    """Write the figures of a report as SVG into a folder, numbered by section; return how many there are."""
+    """Write the figures of a report as SVG into a folder, numbered by section; return their number."""
     from calib.procedure.report.charts import vector
 
     count = 0
@@ -62,10 +62,11 @@ def html(page: Page) -> str:
 
 
 def pdf(page: Certificate) -> tuple[bytes, list[str]]:
-    """Return a certificate as PDF, and what there is to say of it.
+    """Return a certificate as PDF, and notes for the user.
 
-    Where it would have more than `MAX_PAGES` pages, which only very long entries bring about, it is set smaller. Empty
-    in a process forked from one that has used Typst: its threads are not there, and it would wait for them for ever.
+    If it would have more than `MAX_PAGES` pages, which only very long entries cause, it is set in smaller type. The PDF
+    is
+    empty in a process forked from one that has used Typst, whose threads do not exist after a fork.
     """
     if _first_user() != os.getpid():
         return b"", [f"{PAGES[1]} was not written, since this process was forked: start processes by spawn"]
@@ -93,12 +94,12 @@ def _first_user() -> int:
 
 
 def pages(document: bytes) -> int:
-    """Return the number of pages of a PDF by Typst."""
+    """Return the number of pages of a PDF written by Typst."""
     return len(re.findall(rb"/Type\s*/Page\b", document))
 
 
 def _typeset(inputs: Mapping[str, bytes], dense: bool) -> tuple[bytes, list[str]]:
-    """Return the PDF of a template and its files, and a note on letters that no font has."""
+    """Return the PDF of a template and its inputs, and a note on letters that no font has."""
     import typst  # 80 MB, and needed for nothing else
 
     notes: list[str] = []
@@ -120,7 +121,7 @@ def _typeset(inputs: Mapping[str, bytes], dense: bool) -> tuple[bytes, list[str]
 
 
 def _fonts() -> Iterator[tuple[list[str], Any]]:
-    """Yield families of fonts to try one after the other, and the standard of the PDF."""
+    """Yield lists of fonts to try in this order, with the PDF standard; None: plain PDF."""
     import typst
 
     yield [FONT], STANDARD

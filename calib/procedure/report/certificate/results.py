@@ -24,9 +24,9 @@ def write_fit(fit_report: Report, drawn: Mapping[str, Picture], folder: Path) ->
     """Write certificate and report of a fit into its folder.
 
     Args:
-        fit_report: of the fit.
-        drawn: the report's figures by name; without any, the certificate has none either.
-        folder: of the fit.
+        fit_report: report of the fit.
+        drawn: the report's figures by name; empty: the certificate has no figures either.
+        folder: folder of the fit.
     """
     rendering.write(folder, *of_fit(fit_report, drawn))
 
@@ -100,9 +100,9 @@ def write_model(model_report: DynamicReport, drawn: Mapping[str, Picture], folde
     """Write certificate and report of an identification into its folder.
 
     Args:
-        model_report: of the identification.
-        drawn: the report's figures by name; without any, the certificate has none either.
-        folder: of the identification.
+        model_report: report of the identification.
+        drawn: the report's figures by name; empty: the certificate has no figures either.
+        folder: folder of the identification.
     """
     rendering.write(folder, *of_model(model_report, drawn))
 
@@ -152,7 +152,7 @@ class SectionResult(Protocol):
 
 
 def notebook(result: SectionResult) -> str:
-    """Return a result as a page for a notebook: the first page of a fit's certificate, else its section of a report."""
+    """Return a result as HTML for a notebook: the first page of a fit's certificate, else its section of a report."""
     from calib.procedure.kinematic_stage.fit import Outcome
     from calib.procedure.report import fit_report
 
