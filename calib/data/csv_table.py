@@ -226,8 +226,7 @@ def opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list[
 
 
 def _as_our_text(path: str | Path) -> IO[str] | None:
-    """Return another program's export as a stream of the toolkit's own table; None where the file needs no translation.
-    """
+    """Return another program's export as a stream of the toolkit's own table; None where the file needs no translation."""
     for read_export in EXPORTS.all():
         export = read_export(path)
         if export is not None:
@@ -336,7 +335,11 @@ def split_units(cells: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]
 
 
 def _read_columns(lines: IO[str], separator: str, names: tuple[str, ...], path: str | Path) -> tuple[np.ndarray, ...]:
-    """Return the columns below the header."""
+    """Return the columns below the header.
+
+    Blocks of rows that contain only numbers are read by numpy, about five times as fast; from the first other block on,
+    the file is read cell by cell.
+    """
     body = _without_comments(lines)
     blocks: list[np.ndarray] = []
     try:

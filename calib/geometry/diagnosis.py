@@ -183,7 +183,7 @@ def scale_of(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> Scale
 
     Args:
         nominal: the arm with base and tool placement fitted for it.
-        blocks: of any kinds; those that measure positions count.
+        blocks: measurements; only blocks with positions are used.
     """
     frames = layout(nominal).frame_index
     residuals, columns = [], []

@@ -193,7 +193,7 @@ def _scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndar
 
 
 def _depend_by_scale(lengths: np.ndarray, split: ColumnSplit) -> np.ndarray:
-    """Return a mask (p - b,) of the dropped columns whose dependence on the kept ones is a common factor on all
+    """Return a mask (p - b,) of the dropped columns that depend on the kept ones as under a common factor on all
     lengths.
 
     Args:

@@ -3,8 +3,8 @@
 ``corners.csv``: the corners detected in the images of a folder, one per row, and why other images are unusable.
 
 Columns ``image``, ``corner``, ``u [px]``, ``v [px]``, ``sigma [px]``; an image without a usable board has one row with
-its ``problem`` and nothing else. The file is written beside the images, so that corners are detected only once; a file
-written by another program is read as well (without ``sigma``: 0.1 px).
+its ``problem`` and nothing else. Written beside the images, so that they are looked at once; a file that another
+program has written is read as well (without ``sigma``: 0.1 px).
 """
 
 from dataclasses import KW_ONLY, dataclass
