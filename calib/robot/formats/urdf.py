@@ -1,13 +1,14 @@
 """URDF files converted to a `Chain`.
 
 A joint origin is a fixed placement followed by six elementary motions of the joint frame, zero at first; the one about
-(revolute) or along (prismatic) the joint axis stands last and moves with q:
+(revolute) or along (prismatic) the joint axis comes last and moves with q:
 
     <joint>.x .y .z .rx .ry .rz, with the moving one called <joint>.offset
 
 So the roll-pitch-yaw angles are never differentiated (at pitch 90° a direction vanishes). Where the axis is none of
-±x ±y ±z, the elements stand in a frame turned so that its z is the axis; the turn is undone behind the joint, so that
-the links' frames are the URDF's. Fixed joints are folded in; what follows the last moving joint becomes the tail.
+±x ±y ±z, the elements are expressed in a frame rotated so that its z is the axis; the rotation is undone behind the
+joint, so that the links' frames are the URDF's. Fixed joints are folded in; what follows the last moving joint becomes
+the tail.
 
 The inertia of a moving body includes every link fixed to it, on the way to the tip and off it; bodies behind other
 actuated joints (a gripper's fingers) are not included.
@@ -40,10 +41,10 @@ def read(
         path: the file.
         base: a link; default the root.
         tip: a link; default see `calib.robot.formats.arm_ends`.
-        joint_names: the joints a measurement file names; the chain holds no others.
+        joint_names: joints named in a measurement file; a chain with other joints is refused.
 
     Raises:
-        RobotError: saying what was found, where, and what to try.
+        RobotError: for an invalid URDF, or if the chain is ambiguous or no serial arm.
     """
     return parse(text(path)[0], str(path), base, tip, joint_names)
 
@@ -68,7 +69,7 @@ def ends(
     The base defaults to the root.
 
     Raises:
-        RobotError: where the choice is not clear, listing the candidates.
+        RobotError: if the choice is ambiguous; the message lists the candidates.
     """
     if base is None:
         if len(tree.roots) > 1:
@@ -127,7 +128,7 @@ def _unused_faults(tree: UrdfTree, path: list[JointTag]) -> list[str]:
 
 
 def align(axis: np.ndarray) -> np.ndarray:
-    """Return the rotation (4, 4) that aligns an elementary axis with a unit axis: identity for ±x ±y ±z, else z.
+    """Return the rotation (4, 4) that turns z onto a unit axis (3,); the identity for ±x ±y ±z.
 
     The columns x and y are any two that complete z (our choice: from the coordinate axis farthest from it).
     """
@@ -209,7 +210,7 @@ def _check_path(tree: UrdfTree, path: list[JointTag], base: str, tip: str, joint
 def _inertias(tree: UrdfTree, path: list[JointTag]) -> np.ndarray | None:
     """Return standard parameters (n, 10) about the frames after the moving elements; None without masses.
 
-    Also None where the body behind a mimic follower has mass: it would need a row of its own.
+    Also None where the body behind a mimic follower has mass, since there is one row per joint only.
     """
     rows = []
     for joint in path:
