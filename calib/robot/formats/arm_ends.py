@@ -1,4 +1,4 @@
-"""Base and tip of a URDF's arm: the root link, and the link at the flange.
+"""Where the arm of a URDF begins and ends: the root, and the flange.
 
 A number typed into a controller relates to the frame at the flange, so the chain ends there, however many links hang on
 the last axis. Three questions are answered one after the other:

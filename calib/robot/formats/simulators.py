@@ -1,7 +1,7 @@
 """MJCF files (MuJoCo) of a `Chain` with masses and drives, and exported files as Pinocchio and yourdfpy read them.
 
-In an MJCF file motor inertia becomes ``armature``. The world is the chain's base. Body frames are the chain's frames,
-one behind each moving element; a mimic joint's follower is tied to its leader by an equality, which MuJoCo keeps
+In an MJCF file motor inertia becomes ``armature``. The world is the chain's base. Bodies stand where the chain's frames
+are, one behind each moving element; a mimic joint's follower is tied to its leader by an equality, which MuJoCo keeps
 softly. The tip is a site. There are no meshes: grey capsules without contact and without mass show the links.
 """
 

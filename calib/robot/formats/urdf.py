@@ -1,14 +1,13 @@
 """URDF files converted to a `Chain`.
 
 A joint origin is a fixed placement followed by six elementary motions of the joint frame, zero at first; the one about
-(revolute) or along (prismatic) the joint axis comes last and moves with q:
+(revolute) or along (prismatic) the joint axis stands last and moves with q:
 
     <joint>.x .y .z .rx .ry .rz, with the moving one called <joint>.offset
 
 So the roll-pitch-yaw angles are never differentiated (at pitch 90° a direction vanishes). Where the axis is none of
-±x ±y ±z, the elements are expressed in a frame rotated so that its z is the axis; the rotation is undone behind the
-joint, so that the links' frames are the URDF's. Fixed joints are folded in; what follows the last moving joint becomes
-the tail.
+±x ±y ±z, the elements stand in a frame turned so that its z is the axis; the turn is undone behind the joint, so that
+the links' frames are the URDF's. Fixed joints are folded in; what follows the last moving joint becomes the tail.
 
 The inertia of a moving body includes every link fixed to it, on the way to the tip and off it; bodies behind other
 actuated joints (a gripper's fingers) are not included.

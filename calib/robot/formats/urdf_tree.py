@@ -3,7 +3,7 @@
 Reads what the kinematics and the inertias need and nothing else; pictures, transmissions and simulator tags stay in the
 text, where `calib.robot.formats.urdf_write` leaves them untouched.
 
-The XML tree records the position of each element in the text, for messages by line and for edits in place. Python's
+The XML tree knows where each element stands in the text, for messages by line and for edits in place. Python's
 ElementTree keeps no positions, and yourdfpy (our first choice for URDF) reads broken XML by skipping what it cannot
 parse, gives links without inertia the identity, and fails without a line number. Expat gives byte positions.
 """

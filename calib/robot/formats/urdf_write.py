@@ -5,7 +5,7 @@ simulator tags, meshes, order and blanks stay. With F_k(q) the nominal chain's f
 L_k(q) the frame of the URDF link behind its k-th moving joint, both in the base,
 
     X_k = F_k(q)⁻¹ L_k(q)       has to be the same for every q: both describe the same axes;
-    L'_k = F'_k X_k             the link's frame on the calibrated chain F';
+    L'_k = F'_k X_k             where the link has to stand on the calibrated chain F';
     O'_k = (L'_{k-1} C_k)⁻¹ L'_k  at q = 0, the new origin, C_k being the fixed joints in between, which stay.
 
 Conventions (ours): the base link stays where the nominal chain has its base, so the first joint's origin takes what the
