@@ -226,7 +226,7 @@ def opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list[
 
 
 def _as_our_text(path: str | Path) -> IO[str] | None:
-    """Return another program's export as a stream of the toolkit's own table; None where the file needs no translation."""
+    """Return another program's export as a stream of the toolkit's own table; None for a table of the toolkit."""
     for read_export in EXPORTS.all():
         export = read_export(path)
         if export is not None:

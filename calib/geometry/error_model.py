@@ -170,9 +170,7 @@ class ErrorModel:
         return sigma, np.interp(from_poses + from_ranges, model.reach, radii)
 
     def _widening(self, q: np.ndarray) -> np.ndarray:
-        """Return the factors (m,) by which intervals widen outside the joints' ranges; in full beyond half an end's
-        width.
-        """
+        """Return the factors (m,) by which intervals widen outside the joints' ranges."""
         result = np.ones(len(q))
         for joint, (below, above) in enumerate(self.discrepancy.wider):
             levels = [0.0, END_SHARE, 1.0 - END_SHARE, 1.0]
@@ -191,9 +189,7 @@ def outside(q: np.ndarray, learnt: np.ndarray) -> np.ndarray:
 
 
 def _widened(distance: np.ndarray, width: float, factor: float) -> np.ndarray:
-    """Return the widening factors (m,) at `distance` beyond the end of a joint's range: `factor` beyond half of
-    `width`.
-    """
+    """Return the widening (m,) at `distance` beyond the end of a range: `factor` from half of `width` on."""
     share = np.clip(2.0 * distance / max(width, 1e-9), 0.0, 1.0)
     return 1.0 + (factor - 1.0) * share
 

@@ -146,9 +146,7 @@ def place_pose(arm: np.ndarray, measured: np.ndarray) -> Placements:
 
 
 def by_orientations(arm: np.ndarray, measured: np.ndarray) -> Placements:
-    """Return S and X (4, 4) by Shah's method: accurate if the poses rotate about two axes by much more than their
-    errors.
-    """
+    """Return S and X by Shah's method: accurate if the poses rotate about two axes by much more than their errors."""
     # vec(R_S R_A R_X) = vec(R_B): the sum of R_B ⊗ R_A has vec(R_S) and vec(R_X) as its first singular pair
     kernel = np.einsum("mij,mkl->ikjl", measured[:, :3, :3], arm[:, :3, :3]).reshape(9, 9)
     u, _, vt = np.linalg.svd(kernel)

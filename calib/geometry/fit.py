@@ -293,9 +293,7 @@ def _most_probable_widths(
 
 
 def _making_families(cell: Installation, free: np.ndarray, has_stated_prior: np.ndarray) -> np.ndarray:
-    """Return the number (f,) of each parameter's family (joint offsets, other angles, lengths); -1 for no width of
-    making.
-    """
+    """Return each parameter's family (f,): joint offsets, other angles, lengths; -1 for no width of making."""
     kinds = np.where(has_stated_prior, "", families(cell)[free])
     family = np.full(len(free), -1)
     number = 0

@@ -240,9 +240,7 @@ def _placed(
 
 
 def _placements(entries: tuple[Mapping[str, object], ...], source: str) -> tuple[tuple[str, ...], np.ndarray]:
-    """Return names and placements (k, 4, 4) of the k entries of a table; an entry without a name is named by its
-    number.
-    """
+    """Return names and placements (k, 4, 4) of a table's k entries; an unnamed entry is named by its number."""
     names = []
     placements = []
     for number, entry in enumerate(entries, 1):

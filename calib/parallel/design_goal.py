@@ -184,8 +184,7 @@ def purpose_of(
     folder: Path | None,
     after: Path | None,
 ) -> Purpose:
-    """Return the base columns of a model under some loads, with the information of the identification in folder `after`
-    as prior.
+    """Return the design goal: a model's base columns under some loads, with the prior of the identification `after`.
 
     With `after` the columns are those of the identification; payloads that no load contains rest on the prior alone.
     """

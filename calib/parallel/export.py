@@ -122,8 +122,7 @@ class OpenedRobot:
 
     @cached_property
     def chains(self) -> list[Chain]:
-        """The legs as chains with unique names; the last link of each rigid leg has its share of the platform's mass.
-        """
+        """The legs as chains with unique names; the last link of each rigid leg has its share of the platform's mass."""
         robot = self.mechanism.robot
         rows = self.model.leg_parameters(self.values)
         names = [joint.name for leg in robot.legs for joint in leg.chain.joints]
@@ -261,9 +260,7 @@ class _Source:
 
 @dataclass(frozen=True, eq=False)
 class _ArmBodies:
-    """The bodies of a parallel robot in the form of an arm's: number of bodies and joints, labels, and joint of each
-    body.
-    """
+    """The bodies of a parallel robot in an arm's form: number of bodies and joints, labels, joint of each body."""
 
     count: int
     n: int
@@ -454,8 +451,7 @@ def _uses() -> Iterator[str]:
 
 
 def _check(opened: OpenedRobot, text: str, where: str, postures: int = 5) -> None:
-    """Raise RobotError if Pinocchio computes open loops or other forces on the platform from a file, on random motion.
-    """
+    """Raise RobotError if Pinocchio computes open loops or other forces on the platform from a file, on random motion."""
     mechanism = opened.mechanism
     rng = np.random.default_rng(0)
     r = opened.mechanism.robot.r
@@ -518,9 +514,7 @@ def _models(text: str) -> list[NativeModel]:
 def _forces(
     opened: OpenedRobot, model: NativeModel, motion: LoopMotion, m: int, frames: dict[str, np.ndarray]
 ) -> np.ndarray:
-    """Return the forces (r,) of a Pinocchio model on the platform's coordinates in sample m; frames of the model's
-    links are added to `frames`.
-    """
+    """Return the forces (r,) on the platform's coordinates in sample m by a Pinocchio model; adds to `frames`."""
     pin = import_module("pinocchio")
     data = model.createData()
     mechanism = opened.mechanism

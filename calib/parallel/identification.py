@@ -258,9 +258,7 @@ def _of_arms(method: Method) -> bool:
 
 
 def _encoders(mechanism: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding]:
-    """Yield findings on contradictory redundant encoders, and on recorded columns of passive joints, which are not
-    used.
-    """
+    """Yield findings on contradictory redundant encoders, and on columns of passive joints (not used)."""
     robot = mechanism.robot
     passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
     for case in cases:

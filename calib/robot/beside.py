@@ -94,8 +94,7 @@ def _carrier(tree: UrdfTree, link: str, bodies: dict[str, int]) -> str:
 
 
 def _position(tree: UrdfTree, base: str, link: str, carrier: str, posture: Mapping[str, float]) -> np.ndarray:
-    """Return the origin (3,) of a link in the frame of the chain's moving element that carries the link, or in the
-    base.
+    """Return the origin (3,) [m] of a link in the frame of the moving element that carries it, or in the base.
 
     The element's frame is turned where its axis is oblique (`calib.robot.formats.urdf`).
     """

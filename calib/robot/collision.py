@@ -142,9 +142,7 @@ class Collision:
             yield geometry_data.distanceResults
 
     def _configurations(self, q: np.ndarray) -> np.ndarray:
-        """Return Pinocchio's configurations (m, nq) at joint values q (m, n), with joints outside the chain at the
-        model's posture.
-        """
+        """Return Pinocchio's configurations (m, nq) at q (m, n), joints outside the chain at the model's posture."""
         result = configurations(self._model, self._chain, q)
         set_still(self._model, result, self._posture)
         return result
@@ -322,8 +320,7 @@ def _solid(kind: str, sizes: Sequence[float]) -> NativeShape:
 
 
 def set_still(model: NativeModel, configurations: np.ndarray, posture: Mapping[str, float]) -> None:
-    """Write the posture of the joints outside the chain [rad or m], by name, into Pinocchio's configurations (m, nq).
-    """
+    """Write the posture of the joints outside the chain [rad or m], by name, into Pinocchio's configurations (m, nq)."""
     for name, value in posture.items():
         joint = model.joints[model.getJointId(name)]
         values = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]

@@ -157,8 +157,7 @@ def remarks(chain: Chain, bodies: bool = True) -> tuple[str, ...]:
 
 
 def impossible_bodies(chain: Chain) -> tuple[str, ...]:
-    """Return a sentence per group of physically impossible bodies, with their joints; () if all are possible or masses
-    are unknown.
+    """Return a sentence per group of physically impossible bodies, with their joints; () if there are none.
 
     A body has M > 0 and, about its centre of mass, positive principal moments of which none exceeds the sum of the
     others (triangle inequality; Wensing, Kim and Slotine, 2018, eq. 7). Its radius of gyration and its centre of mass

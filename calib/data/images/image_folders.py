@@ -120,8 +120,7 @@ def joint_table(path: Path) -> Table:
 
 
 def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progress | None = None) -> Found:
-    """Return the corners of a folder's images: from ``corners.csv`` where it is newer than the images, else by
-    detection.
+    """Return the corners of a folder's images: from ``corners.csv`` if newer than the images, else by detection.
 
     Args:
         path: the folder.

@@ -62,7 +62,7 @@ class InstrumentExport(io.StringIO):
 
 @dataclass(frozen=True)
 class Grid:
-    """Location of the numbers in a text: separator, decimal mark, index and cells of their first line, rows above it."""
+    """Location of the numbers in a text: separator, decimal mark, index and cells of the first line, rows above."""
 
     separator: str
     mark: str
@@ -83,9 +83,7 @@ def presets() -> dict[str, dict[str, str]]:
 
 
 def translated(path: str | Path) -> InstrumentExport | None:
-    """Return the file at `path` as a table of the toolkit; None where the file is such a table already, or is no table
-    of positions.
-    """
+    """Return the file at `path` as a table of the toolkit; None if it is one already, or has no positions."""
     with open(path, "rb") as file:
         beginning = file.read(HEAD)
         is_utf16 = beginning[:2] in (b"\xff\xfe", b"\xfe\xff")
@@ -163,7 +161,7 @@ def _length_unit(preset: dict[str, str], head: str, preamble: Sequence[str]) -> 
 
 
 def _grid(lines: Sequence[str]) -> Grid | None:
-    """Return the location of the numbers in a text, for the separator that makes most cells of a line numbers; or None."""
+    """Return the location of a text's numbers, with the separator that makes most cells of a line numbers; or None."""
     content = [(i, line) for i, line in enumerate(lines) if _is_content(line)]
     best, best_count = None, MIN_NUMBERS - 1
     for separator in "\t;|, ":
@@ -253,7 +251,7 @@ def _is_ours(names: Sequence[str]) -> bool:
 
 
 def _unnamed(grid: Grid) -> tuple[list[str], list[str]]:
-    """Return names and units for columns without names: texts, then x, y, z; empty lists if the first cell is no text."""
+    """Return names and units for columns without names: texts, then x, y, z; empty if the first cell is no text."""
     numeric = grid.numeric
     texts = numeric.index(True)
     if not 0 < texts <= 3 or not all(numeric[texts : texts + 3]):

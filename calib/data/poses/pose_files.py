@@ -374,7 +374,7 @@ def _sigma(sheet: Sheet, layout: Layout, visible: np.ndarray) -> np.ndarray | No
 
 
 def _late(sheet: Sheet, layout: Layout, index: np.ndarray) -> np.ndarray | None:
-    """Return the derivatives (m, 2, 3) of positions by a clock's offset [m/s] and drift [m]; None without its columns."""
+    """Return the derivatives (m, 2, 3) of positions by a clock's offset and drift [m/s, m]; None if not stated."""
     if not layout.late:
         return None
     velocity = sheet.numbers(layout.late[:3], LATE)[index]

@@ -154,7 +154,7 @@ def check_against(
 def unmeasured(
     plan: ArrayLike, measured: Sequence[PoseMeasurements], max_difference: float = MAX_JOINT_DIFFERENCE
 ) -> tuple[str, ...]:
-    """Return a note on the planned poses (m, n) [rad or m] that are in none of the blocks; empty if all were measured."""
+    """Return a note on the planned poses (m, n) [rad or m] that are in none of the blocks; () if all were measured."""
     if not measured:
         return ()
     plan = np.asarray(plan)

@@ -45,7 +45,7 @@ CHUNK = 1 << 16
 
 
 def read_archive(path: Path, joints: Joints | None, options: RecordingOptions, ends: Ends = (None, None)) -> Recording:
-    """Return the recording in a NumPy archive (.npz) from ends[0] to ends[1] [s]; values are not checked, only shapes."""
+    """Return the recording in a NumPy archive (.npz) from ends[0] to ends[1] [s]; values are not checked."""
     with _opened(path) as archive:
         return _recording(archive, joints, options, ends)
 

@@ -171,7 +171,7 @@ def stem_of(name: str) -> tuple[str, int | None]:
 
 
 def plain_stems(stems: Sequence[str]) -> dict[str, str]:
-    """Return a map to each stem from the stem itself and, if unique, from the stem without leading words of `MEASURED`."""
+    """Return a map to each stem from itself and, if unique, from its form without leading words of `MEASURED`."""
     short: dict[str, list[str]] = {}
     for stem in stems:
         parts = stem.split("_")

@@ -198,7 +198,7 @@ def _strangers(block: Pixels, arm: np.ndarray, placed: Placement, poses: np.ndar
 
 
 def seen_target(mounting: str, poses: np.ndarray) -> np.ndarray:
-    """Return the pose (m, 4, 4) of what the arm carries in the fixed one's frame (camera or board), from board poses."""
+    """Return the poses (m, 4, 4) of the carried one of camera and board in the fixed one's frame, from board poses."""
     if mounting == IN_HAND:
         return invert(poses)
     return poses
@@ -261,7 +261,7 @@ def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:
 def _check_pairing(
     block: Pixels, arm: np.ndarray, poses: np.ndarray, mountings: Sequence[str], placed: Placement, lever: float
 ) -> None:
-    """Raise MeasurementError if the joint values are shifted against the images by some rows, or do not match at all."""
+    """Raise MeasurementError if the joint values are shifted against the images by some rows, or do not match."""
     if placed.error <= 0.01 * lever or len(arm) < 6:
         return
     count = len(arm)

@@ -145,7 +145,7 @@ def _positions_at(cell: Installation, fit: GeometricFit, q: np.ndarray) -> Posit
 
 
 def _nominal_error(fit: GeometricFit, nominal: Installation, q: np.ndarray) -> float | None:
-    """Return the nominal arm's rms error [m] at postures (m, n) if the calibrated arm is true; None without positions."""
+    """Return the nominal arm's rms error [m] at postures (m, n) if the calibrated arm is true; or None."""
     block = _positions_at(fit.cell, fit, q)
     with suppress(CalibError):
         placed = polish_frames(nominal, [block]).cell

@@ -83,7 +83,7 @@ def row_shifts(nominal: Installation, blocks: Blocks, max_left: float) -> list[C
 
 
 def _best_first(nominal: Installation, block: Positions, shift: int) -> int | None:
-    """Return the row number from which on a shift by `shift` rows explains the positions best; None for too few rows."""
+    """Return the row from which on a shift by `shift` rows explains the positions best; None for too few rows."""
     numbers = np.unique(block.rows)[: -MIN_SHIFTED - abs(shift)]
     if len(numbers) < MIN_SHIFTED or len(_shifted(block, 0, shift)) < MIN_PAIRED * len(block):
         return None

@@ -61,7 +61,7 @@ class LoopFit:
     Attributes:
         mechanism: the calibrated robot, its loops closed.
         parameters: constants that may change; estimate: changes from the nominal robot, with covariance.
-        vague: names of parameters whose prior variance the data reduce by less than half.
+        vague: names of parameters whose σ remains above half that of the prior.
         before, after: rms of the encoders' residuals [rad or m], nominal and calibrated.
         iterations: number of Gauss–Newton iterations.
     """

@@ -63,9 +63,7 @@ class ParallelPlant:
         return self.model.joint_noise(noise)
 
     def inertia_diagonal(self, q: np.ndarray) -> np.ndarray:
-        """Raise an error: gains proportional to inertia are not supported, since redundant actuators have no inertia
-        each.
-        """
+        """Raise an error: gains proportional to inertia are not supported for parallel robots."""
         raise UsageError("[loop] design is for serial arms only; state the gains as they are")
 
     def feed_forward(self, reference: Reference) -> np.ndarray:

@@ -241,9 +241,7 @@ class _Axes:
         return len(self.tree.ancestry(joint.child))
 
     def _is_jaw(self, joint: JointTag) -> bool:
-        """Return whether a joint's name, or its link's, is that of a jaw; a word in all names of the arm is a prefix
-        and ignored.
-        """
+        """Return whether a joint's or its link's name is that of a jaw; words common to the whole arm are ignored."""
         first = self._first(joint.child)
         name, link = joint.name.lower(), joint.child.lower()
         if name == first or self._is_named_axis(joint):
@@ -380,8 +378,7 @@ def _frame(tree: UrdfTree, body: str) -> tuple[str, str]:
 
 
 def _without_tools(tree: UrdfTree, body: str) -> list[str]:
-    """Return the links fixed to a body, the body's main link first, without grippers, sensors and links fixed to these.
-    """
+    """Return the links fixed to a body, the body's main link first, without grippers, sensors and links on these."""
     prefix = body.lower()
     result: list[str] = []
     todo = [body]
