@@ -122,7 +122,7 @@ class OpenedRobot:
 
     @cached_property
     def chains(self) -> list[Chain]:
-        """The legs as chains with unique names; the last link of each rigid leg has its share of the platform's mass."""
+        """The legs as chains, uniquely named; the last link of each rigid leg has its share of the platform's mass."""
         robot = self.mechanism.robot
         rows = self.model.leg_parameters(self.values)
         names = [joint.name for leg in robot.legs for joint in leg.chain.joints]
@@ -451,7 +451,7 @@ def _uses() -> Iterator[str]:
 
 
 def _check(opened: OpenedRobot, text: str, where: str, postures: int = 5) -> None:
-    """Raise RobotError if Pinocchio computes open loops or other forces on the platform from a file, on random motion."""
+    """Raise RobotError if Pinocchio computes open loops or other forces on the platform on random motion."""
     mechanism = opened.mechanism
     rng = np.random.default_rng(0)
     r = opened.mechanism.robot.r

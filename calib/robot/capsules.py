@@ -170,7 +170,7 @@ class Capsules:
         return (*arm_pairs, *world_pairs)
 
     def distances(self, q: np.ndarray) -> np.ndarray:
-        """Return the distances (m, pairs) [m] at joint values q (m, n); negative values are the depth of penetration."""
+        """Return the distances (m, pairs) [m] at joint values q (m, n); negative: depth of penetration."""
         return self._pair_distances(self.lines_at(q))[0]
 
     def gradients(self, q: np.ndarray) -> np.ndarray:

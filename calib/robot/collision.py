@@ -320,7 +320,7 @@ def _solid(kind: str, sizes: Sequence[float]) -> NativeShape:
 
 
 def set_still(model: NativeModel, configurations: np.ndarray, posture: Mapping[str, float]) -> None:
-    """Write the posture of the joints outside the chain [rad or m], by name, into Pinocchio's configurations (m, nq)."""
+    """Write the values of joints outside the chain [rad or m], by name, into Pinocchio's configurations (m, nq)."""
     for name, value in posture.items():
         joint = model.joints[model.getJointId(name)]
         values = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
