@@ -27,9 +27,9 @@ def report(error: BaseException, command: Sequence[str], folder: Path | None = N
     """Write a bug report for an unexpected error, and return a one-line message about it.
 
     Args:
-        error: with its traceback.
+        error: the error, with its traceback.
         command: the words after ``calib``.
-        folder: where the file is to go; by default the current one, or the system's for temporary files.
+        folder: folder of the report; by default the current one, or the system's for temporary files.
     """
     name = f"calib-bug-{datetime.now():%Y%m%d-%H%M%S}-{id(error) % 9973}.txt"
     content = "\n".join([f"calib {shlex.join(command)}", *_head(), "", *traceback.format_exception(error)])

@@ -1,9 +1,9 @@
 """Search for a small change of columns (sign, order, coupling) that explains the data far better.
 
-Columns of poses or recordings may not be what they are said to be: a sign, an exchange, a zero, a unit, the hand of the
+Columns of poses or recordings may be mislabelled: a sign, an exchange, a zero, a unit, the hand of the
 axes, a joint that counts from the horizontal instead of from the link before it, or that moves nothing measured. Each
-`Change` of a table is made, what the data leave unexplained then is compared with what they leave as recorded, and the
-best change counts.
+`Change` of a table is applied, the model's residuals on the changed data are compared with those on the data as
+recorded, and the best change is chosen.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -28,8 +28,8 @@ class Change(Generic[Data]):
     """One possible error in the meaning of columns.
 
     Attributes:
-        code: of the finding on this change.
-        make: data as recorded → changed data.
+        code: code of the finding on this change.
+        make: maps the data as recorded to the changed data.
         joints: indices of the joints concerned, from 0.
         values: further values of the finding.
         max_left: the change is significant if it reduces the rms residual below this share.
@@ -97,14 +97,15 @@ def best_changes(
 ) -> Explanation | None:
     """Return the changes that explain the data best, chosen one by one; None if no change is significant.
 
-    Of changes that explain the data equally the first of the table counts.
+    Of changes that explain the data equally well, the first one in the table is chosen.
 
     Args:
-        data: as recorded.
+        data: the data as recorded.
         table: the changes to try.
-        left: data → (k,) mean squares that are left unexplained; of several their geometric mean is compared.
-        at_least: data → a lower bound of `left` that is quickly known; spares changes that cannot count.
-        max_changes: to make.
+        left: maps data to (k,) mean squared residuals; if k > 1 their geometric mean is compared.
+        at_least: maps data to a quickly computed lower bound of `left`, by which hopeless changes are skipped; None
+            without one.
+        max_changes: largest number of changes to combine.
     """
     candidates = list(table)
     changes: list[Change] = []
@@ -176,7 +177,7 @@ def assigned(cost: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return each joint's column (n,) and sign (n,).
 
     Args:
-        cost: (2, n, n) of column k for joint j, as it is and reversed.
+        cost: (2, n, n) cost of column k for joint j, unchanged and with reversed sign.
     """
     from scipy.optimize import linear_sum_assignment  # slow to load
 

@@ -49,8 +49,8 @@ def read_toml(path: str | Path, error: type[CalibError] = UsageError) -> ParsedT
     """Return the tables of the TOML file at `path`.
 
     Raises:
-        CalibError: `error`, for a file that is missing, too large, no TOML, nested too deeply, or with a whole number
-            of more than 64 bits.
+        CalibError: of class `error`, for a file that is missing, too large, no TOML, nested too deeply, or with an
+            integer of more than 64 bits.
     """
     from calib.files import check_regular
 
@@ -93,11 +93,11 @@ def parse(kind: type[T], table: object, where: str, error: type[CalibError] = Us
     Args:
         kind: a dataclass under `strict`.
         table: lists and tables in it as tomllib makes them.
-        where: names it in complaints.
-        error: the class of complaints.
+        where: name of the table in messages.
+        error: class of the errors raised.
 
     Raises:
-        CalibError: `error`, for the first key that is unknown, missing, or holds what it cannot hold.
+        CalibError: of class `error`, for the first key that is unknown, missing, or has an invalid value.
     """
     from pydantic import ValidationError
 
@@ -111,7 +111,7 @@ def read(kind: type[T], source: Tables | None, name: str, foreign_tables: Collec
     """Return the parsed content of a TOML file or of its tables in memory, and its name for messages.
 
     Args:
-        name: in place of a file's.
+        name: name for messages, if `source` is no file.
         foreign_tables: names of tables that another reader takes.
     """
     if source is None or isinstance(source, Mapping):

@@ -67,12 +67,12 @@ def number(value: object, place: str, quantity: str = "", error: type[CalibError
     """Return a number in SI, from a number of TOML or a text: an expression with pi, followed by a unit.
 
     Args:
-        value: ``0.4``, ``"-pi/2"``, ``"90 deg"``; infinite ones count.
-        place: names it in the complaint.
+        value: ``0.4``, ``"-pi/2"``, ``"90 deg"``; infinite values are accepted.
+        place: name of the value in messages.
         quantity: a key of `calib.units.QUANTITIES`; "" for a plain number.
 
     Raises:
-        CalibError: `error`, where it is no number, or has a unit of something else.
+        CalibError: of class `error`, if the value is no number or has a unit of another quantity.
     """
     try:
         return _number(value, quantity)
@@ -126,7 +126,7 @@ def evaluated(node: ast.expr, names: Mapping[str, Any] = _NAMES, operations: Ope
         operations: class of the operation, as `ast` has it → function of two values.
 
     Raises:
-        ValueError: with the part that is something else.
+        ValueError: naming the invalid part of the expression.
     """
     inner = partial(evaluated, names=names, operations=operations)
     match node:

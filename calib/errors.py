@@ -110,7 +110,7 @@ class Unidentifiable(CalibError):
 
     Attributes:
         names: the parameters concerned.
-        singular_values: of the column-scaled observation matrix, falling.
+        singular_values: singular values of the column-scaled observation matrix, in falling order.
     """
 
     def __init__(self, message: str, names: Sequence[str] = (), singular_values: np.ndarray | None = None):
@@ -138,8 +138,8 @@ class TaskLost(CalibError):
     """A task whose worker process died at every attempt; the results of the other tasks are valid.
 
     Attributes:
-        number: of the task, from 0.
-        task: what the function was given.
+        number: number of the task, from 0.
+        task: the argument of the function.
     """
 
     def __init__(self, message: str, number: int = 0, task: object = None):

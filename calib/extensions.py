@@ -38,11 +38,11 @@ T = TypeVar("T")
 
 
 class Point(Generic[T]):
-    """One place where packages add to the core; `T` is the type of what each of them offers there.
+    """A door: a typed extension point where packages add to the toolkit; `T` is the type of each offer.
 
     Attributes:
         name: one of `POINTS`.
-        about: what is offered.
+        about: description of the offers.
     """
 
     def __init__(self, name: str, about: str) -> None:
@@ -63,7 +63,7 @@ class Point(Generic[T]):
         """Return the first offer.
 
         Raises:
-            UsageError: where there is none, and as `all`.
+            UsageError: if there is no offer, or as for `all`.
         """
         for offer in self.all():
             return offer

@@ -82,9 +82,9 @@ def check_results(targets: Results, inputs: Iterable[str | Path | None] = (), ov
     """Raise an error, before any work is done, for target files that cannot be written, are inputs, or coincide.
 
     Args:
-        targets: to be written, each with the suffixes that it may have; what stands there is replaced where an earlier
-            run left it and nobody has changed it since (`RESULTS` says so), or with `overwrite`.
-        inputs: what is read.
+        targets: files to be written, each with its allowed suffixes; an existing file is replaced if an earlier run
+            wrote it and it is unchanged since (by the checksums in `RESULTS`), or with `overwrite`.
+        inputs: input files.
 
     Raises:
         UsageError: with the file concerned.
@@ -113,7 +113,7 @@ def _written(path: Path) -> dict[str, str]:
 
 @contextmanager
 def locked(path: Path, busy: str, kind: type[CalibError] = UsageError) -> Iterator[str]:
-    """Hold a lock file for the block; yield who held it last, if that process was killed, else an empty text.
+    """Hold a lock file for the block; yield the name of the last holder if that process was killed, else "".
 
     The lock is the kernel's (flock), so that it ends with the process; the file says whose it is.
 
@@ -283,7 +283,7 @@ def check_not_input(targets: Iterable[Path], inputs: Iterable[str | Path | None]
     """Raise an error, before any work is done, for a target that is one of the input files or folders.
 
     Args:
-        targets: to be written.
+        targets: files to be written.
         inputs: to be read, recordings with their cut (``log.npz@0:9``), too; names that are no path on the disk (robots
             of the library), and None, are passed over.
 

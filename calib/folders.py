@@ -47,9 +47,9 @@ def check_target(
     """Raise an error, before any work is done, for a folder that cannot be written or contains other files.
 
     Args:
-        out: where results are to go.
+        out: folder for the results.
         ours: names, or patterns of them (``plot_torque_*.png``), of all files that may be written there.
-        marks: those by which an earlier result of the same kind is known.
+        marks: names of files by which an earlier result of this kind is recognised.
         what: that kind, for messages.
         inputs: what is read, recordings with their cut (``log.npz@0:9``), too; none of it is written over.
 
@@ -82,11 +82,11 @@ def files_of(folder: Path, ours: Collection[str]) -> list[str]:
 def write_staged(out: Path, ours: Collection[str], write: Callable[[Path], object]) -> Path:
     """Run `write` on a temporary folder next to `out`, then move its files to `out`.
 
-    A folder that is not there appears whole; in one from an earlier run each file is replaced, its own other files
-    (`ours`, names or patterns) go, and what else lies there stays.
+    A new folder appears complete. In a folder of an earlier run each file is replaced, further files that match `ours`
+    (names or patterns) are removed, and all others stay.
 
     Raises:
-        UsageError: where the disk refuses.
+        UsageError: if the disk refuses to write.
     """
     requested = out
     try:
@@ -166,7 +166,7 @@ def read_covariance(path: Path) -> tuple[tuple[str, ...], np.ndarray]:
         path: of the table, or of the folder that holds ``covariance.csv``.
 
     Raises:
-        RobotError: where it is missing or damaged.
+        RobotError: if the file is missing or damaged.
     """
     if path.is_dir():
         path = path / COVARIANCE

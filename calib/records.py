@@ -199,10 +199,10 @@ def read_record(kind: type[T], content: object, where: str = "") -> T:
     missing.
 
     Args:
-        where: what `content` is, for messages.
+        where: name of `content` for messages.
 
     Raises:
-        ValueError: where something else stands there, or nothing, with its place.
+        ValueError: for a missing or invalid value, with its location.
     """
     from pydantic import ValidationError
 

@@ -1,4 +1,4 @@
-"""Kinds of results on disk: how a folder is recognised, what made it, and what a verb says that does not take it.
+"""Kinds of results on disk: how a folder is recognised, what made it, and the message of a verb that does not take it.
 
 Every verb that takes a result (`calib view`, `certificate`, `export`, `diff` …) refuses others by `refusal`, so that
 the message says what the folder is, and which folder or command to use instead. What a result of each kind can do is
@@ -18,12 +18,12 @@ class ResultKind:
     """One kind of result.
 
     Attributes:
-        name: what `kind_of` is compared with.
-        noun: what a folder of this kind is, with its article.
+        name: identifier of the kind.
+        noun: noun for a folder of this kind, with its article.
         marks: sets of files, each of which identifies a folder of this kind.
-        advice: verb → what to do instead, a clause with ``{folder}``.
-        companion: of a kind that is a file: how the name of the file beside it goes on after its stem.
-        array: of a kind that is an archive of arrays: one that only this kind has.
+        advice: map from a verb to advice on what to do instead, a clause with ``{folder}``.
+        companion: for a kind that is a file: suffix, after the stem, of the name of the file beside it.
+        array: for a kind that is an archive of arrays: name of an array that only this kind contains.
     """
 
     name: str
@@ -43,7 +43,7 @@ class ResultKind:
 
 
 def _members(archive: Path) -> list[str]:
-    """Return the names of what an archive holds; empty where it is none."""
+    """Return the names of an archive's members; empty if the file is no archive."""
     try:
         with ZipFile(archive) as content:
             return content.namelist()
@@ -123,7 +123,7 @@ def kind_of(path: str | Path) -> ResultKind | None:
 
 
 def refusal(path: str | Path, verb: str) -> str:
-    """Return the message of a verb that does not take a path: what it is, what the verb takes, what to do.
+    """Return the message of a verb that does not take a path: what the path is, what the verb takes, what to do.
 
     Args:
         path: what the user named.

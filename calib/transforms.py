@@ -36,7 +36,7 @@ def from_xyz_rpy(xyz: ArrayLike, rpy: ArrayLike) -> np.ndarray:
 def to_xyz_rpy(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return xyz [m] and roll-pitch-yaw [rad] of one pose (4, 4); the round trip is exact near pitch ±90°, too.
 
-    Roll is taken from Rz(-yaw) R instead of from R, so that it makes up for whatever yaw is where yaw is ill defined.
+    Roll is taken from Rz(-yaw) R instead of from R, so that it compensates an arbitrary yaw where yaw is ill defined.
     """
     rotation = poses[:3, :3]
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0])

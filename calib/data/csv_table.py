@@ -51,12 +51,12 @@ class Table:
     """Header, units and cells of a CSV file, before conversion to SI.
 
     Attributes:
-        file: its path, for messages.
+        file: path of the file, for messages.
         header: column names without units.
-        units: what stood in brackets behind each name; "" where nothing did.
+        units: unit in brackets behind each name; "" where there is none.
         cells: one array per column: floats (NaN where a cell is empty) where every cell is a number, else texts.
         rows: (m,) number of each row in the file; data rows count from 1.
-        notes: how a file of another program was read.
+        notes: remarks on how a file of another program was read.
     """
 
     file: str
@@ -73,11 +73,15 @@ class Table:
         return name in self.header
 
     def fail(self, message: str, column: str | None = None, row: int | None = None) -> NoReturn:
-        """Refuse the table, one of its columns, or one cell of a column (row from 0)."""
+        """Raise MeasurementError about the table, one of its columns, or one cell of a column (row from 0)."""
         refuse_data(self.file, message, column, None if row is None else int(self.rows[row]))
 
     def index(self, name: str) -> int:
-        """Return the index of column `name`; refuse a missing column and suggest the nearest name."""
+        """Return the index of column `name`.
+
+        Raises:
+            MeasurementError: for a missing column, with the most similar name.
+        """
         if name not in self.header:
             headings = ", ".join(self.header)
             self.fail(f"column '{name}' is missing{suggestion(name, self.header)}; found: {headings}")
@@ -91,7 +95,9 @@ class Table:
         return [plain_text(str(cell)) for cell in cells]
 
     def block(self, head: str) -> np.ndarray | None:
-        """Return the columns head_joint1 …, or head1 …, as one array (m, n), as they are; None if there are none."""
+        """Return the columns head_joint1 …, or head1 …, as one array (m, n), not converted to SI; None if there are
+        none.
+        """
         names = [name for name in self.header if re.fullmatch(rf"{head}(\d+|_.+)", name)]
         if not names:
             return None
@@ -102,12 +108,12 @@ class Table:
 
         Args:
             dimension: ``angle`` [rad], ``length`` [m], ``joint`` (either), ``speed`` [m/s], ``time`` [s], "" (a plain
-                number) or None (as it is).
-            unit: what the column is in where its header does not say; "" for SI.
-            gaps: leave empty and NaN cells as NaN, where otherwise they are refused.
+                number) or None (not converted).
+            unit: unit of a column whose header states none; "" for SI.
+            gaps: whether empty and NaN cells become NaN; otherwise they are refused.
 
         Raises:
-            MeasurementError: at the first cell that is no number, or not finite; at a unit of another dimension.
+            MeasurementError: for a cell that is no finite number, or a unit of another dimension.
         """
         column = self.index(name)
         (cells,) = self.check((name,), (name,) if gaps else ())
@@ -118,14 +124,14 @@ class Table:
         return cells * self.factor(column, units[dimension], unit)
 
     def check(self, names: Sequence[str], gaps: Collection[str] = ()) -> list[np.ndarray]:
-        """Return columns (m,) as floats, as they are; refuse the table where a cell of them is no finite number.
+        """Return columns (m,) as floats, not converted to SI; refuse a table with a cell that is no finite number.
 
         Args:
-            names: of the columns.
+            names: names of the columns.
             gaps: names of columns whose cells may be empty or NaN.
 
         Raises:
-            MeasurementError: at the first such row of the file, with the number of such rows, in all and by column.
+            MeasurementError: naming the first row with such a cell, and how many rows have one, in all and by column.
         """
         cells = [self.cells[self.index(name)] for name in names]
         columns = []
@@ -138,7 +144,7 @@ class Table:
         return columns
 
     def factor(self, column: int, factors: Mapping[str, float], unit: str) -> float:
-        """Return the factor to SI of a column; the unit is in its header or in `unit`, and one of `factors`."""
+        """Return the factor to SI of a column, one of `factors`; its unit is stated in the header or in `unit`."""
         name, header_unit = self.header[column], self.units[column]
         if header_unit and unit and header_unit != unit:
             self.fail(f"the header states [{header_unit}], the options state {unit}: remove one of them", name)
@@ -220,7 +226,7 @@ def opened(path: str | Path, headed: bool) -> Iterator[tuple[IO[str], str, list[
 
 
 def _as_our_text(path: str | Path) -> IO[str] | None:
-    """Return another program's export as a stream of our text; None where the file is our table already."""
+    """Return another program's export as a stream of the toolkit's own table; None for a table of the toolkit."""
     for read_export in EXPORTS.all():
         export = read_export(path)
         if export is not None:
@@ -260,7 +266,7 @@ def _first_line(file: IO[str], path: str | Path, headed: bool) -> tuple[str, lis
 
 
 def _with_quoted_breaks(line: str, file: IO[str]) -> str:
-    """Return a line with those after it, where a quoted name holds line breaks."""
+    """Return a line joined with the lines after it, where a quoted name contains line breaks."""
     while line.count('"') % 2 and len(line) < LONGEST:
         continuation = file.readline(LONGEST)
         if not continuation:
@@ -329,8 +335,11 @@ def split_units(cells: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]
 
 
 def _read_columns(lines: IO[str], separator: str, names: tuple[str, ...], path: str | Path) -> tuple[np.ndarray, ...]:
-    """Return the columns below the header. Blocks of nothing but numbers, one in each cell, are read by numpy, some
-    five times as fast; from the first block on that is anything else, cell by cell."""
+    """Return the columns below the header.
+
+    Blocks of rows that contain only numbers are read by numpy, about five times as fast; from the first other block on,
+    the file is read cell by cell.
+    """
     body = _without_comments(lines)
     blocks: list[np.ndarray] = []
     try:

@@ -1,7 +1,7 @@
 """Declarations of table columns (names, dimension, bounds), and the error about a cell beyond them.
 
-Poses, targets, waypoints and recordings read their tables by these declarations. An impossible value is refused by
-`refuse`: the value first, what to do last, then how many more rows are like it, by column where they are of several;
+Poses, targets, waypoints and recordings read their tables by these declarations. `refuse` raises the error about an
+impossible value: the value, advice, and how many more rows have such a value (by column, if there are several columns);
 the error carries file, row and column.
 """
 
@@ -81,7 +81,7 @@ class Rows(Protocol):
     """Source of rows named in an error: a table, a recording or a block of measurements.
 
     Attributes:
-        file: where it came from.
+        file: path of the file.
         rows: (m,) number of each row in the file, from 1.
     """
 
@@ -100,8 +100,8 @@ def refuse(source: Rows, bad: np.ndarray, columns: Sequence[str], says: Callable
         says: returns the message for the first bad cell from its row and column (from 0).
 
     Raises:
-        MeasurementError: with file, row and column of the first bad cell, and the number of further rows among those
-            read, with the number of bad rows in each column where there are several.
+        MeasurementError: with file, row and column of the first bad cell, and the number of further bad rows (by
+            column, if there are several columns).
     """
     if not np.any(bad):
         return
@@ -112,9 +112,10 @@ def refuse(source: Rows, bad: np.ndarray, columns: Sequence[str], says: Callable
 
 
 def more_rows(source: Rows, bad: np.ndarray, columns: Sequence[str]) -> str:
-    """Return words on the rows marked in `bad` (m, k) after the first: how many they are, and of all, in each column.
+    """Return words on the rows marked in `bad` (m, k) after the first: their number, the number of all rows, and by
+    column.
 
-    Where not all rows of a file were read, the words say of how many.
+    Where only a part of the file's rows was read, the words state how many were read.
     """
     count = int(bad.any(axis=1).sum()) - 1
     if not count:
@@ -133,11 +134,11 @@ class Column:
     """One column of a table, or a family of columns (x, y, z).
 
     Attributes:
-        names: ours, in their order.
+        names: the toolkit's names, in order.
         dimension: angle, length, joint, or "" for a plain number.
-        family: name under which options state a unit for all of them.
+        family: name under which options state a unit for all columns of the family.
         most: largest absolute value [SI].
-        likely: the unit that larger values are likely in.
+        likely: the likely unit of values larger than `most`.
         positive: advice if a value is not above zero; "" if it may have any sign.
     """
 
@@ -189,7 +190,7 @@ def check_travel(
     """Refuse joint values (m, n) [rad or m] larger than `most` (n,).
 
     Args:
-        advice: returns the advice for joint j from the unit its values look like.
+        advice: returns the advice for joint j, given the unit in which its values seem to be.
     """
 
     def says(row: int, j: int) -> str:

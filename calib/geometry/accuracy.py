@@ -1,8 +1,8 @@
 """Errors of predicted against measured positions, orientations and distances, as printed on a certificate.
 
     position      |y - p| where positions are measured; |mean of the socket's points - p| for sockets; distance from the
-                  plane for planes; for images the rms over its corners of what separates seen and predicted, across
-                  the line of sight at the corner's distance [m]
+                  plane for planes; for an image the rms over its corners of the distance between seen and predicted
+                  corner, measured across the line of sight at the corner's distance [m]
     orientation   angle of R_y Rᵀ [rad]
     distance      | |p_a - p_b| - known | for distances, bars and sockets a known distance apart; for sockets without
                   one, the deviation of |m_a - m_b| from its mean over the fixture's positions [m]
@@ -54,7 +54,7 @@ class ArmErrors:
 
     @property
     def main(self) -> ErrorStatistics | None:
-        """Errors that decide the verdict: of positions, else of distances [mm]."""
+        """Statistics of the errors that decide the verdict, positions before distances [mm]; None without either."""
         return self.position_mm or self.distance_mm
 
 
@@ -74,7 +74,7 @@ class Errors:
 
     @property
     def main(self) -> np.ndarray:
-        """Errors that decide the verdict: of positions, else of distances."""
+        """Return the errors that decide the verdict, positions before distances [m]; empty without either."""
         if self.position is not None:
             return self.position
         if self.distance is not None:
@@ -102,8 +102,8 @@ def errors(cell: Installation, measured: Sequence[PoseMeasurements]) -> Errors:
     """Return the magnitudes of the prediction errors of all measured rows.
 
     Args:
-        cell: the installation that predicts; it has the stations and tools of the measurements.
-        measured: blocks of any kinds.
+        cell: the installation whose predictions are compared; it has the stations and tools named in the measurements.
+        measured: blocks of measurements, of any kinds.
     """
     sizes: dict[str, list[np.ndarray]] = {"position": [], "orientation": [], "distance": []}
     for block in prepare(cell, measured):
@@ -118,7 +118,7 @@ def errors(cell: Installation, measured: Sequence[PoseMeasurements]) -> Errors:
 
 
 def _concatenated(sizes: list[np.ndarray]) -> np.ndarray | None:
-    """Return all sizes; None without any."""
+    """Return the error magnitudes of all blocks in one array; None for an empty list."""
     result = np.concatenate([np.zeros(0), *sizes])
     return result if len(result) else None
 
@@ -186,8 +186,11 @@ def _pairs(m: int, limit: int, generator: np.random.Generator) -> tuple[np.ndarr
 def _socket_spread(point: np.ndarray, measured: Sockets) -> np.ndarray:
     """Return how much the distance of each socket pair deviates from its mean over all fixture positions [m].
 
-    Of predicted points (3, m) [m]. A group's name is ``<fixture position>/<socket>``; empty where no pair of sockets
-    occurs in two positions.
+    A group's name is ``<fixture position>/<socket>``. Empty where no pair of sockets occurs in two fixture positions.
+
+    Args:
+        point: (3, m) predicted target positions [m].
+        measured: the block of m rows.
     """
     sockets: dict[str, dict[str, np.ndarray]] = {}
     for number in np.unique(measured.group):

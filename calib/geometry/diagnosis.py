@@ -1,8 +1,8 @@
 """Checks of measurements against the model: changed set-up, systematic residuals, changed columns, a scale factor.
 
 Changed columns (joint signs, exchanged joints, mirrored axes, angles of another convention): the nominal arm, base and
-tool placement free, explains rows as measured and with each change; the errors of a sound arm are small compared with
-either.
+tool placement free, is fitted to the rows as measured and with each change; the change is reported where it reduces the
+error far below that.
 """
 
 from collections.abc import Callable, Sequence
@@ -59,7 +59,7 @@ FLIP = np.array([1.0, -1.0, 1.0])
 
 
 def diagnose(fit: GeometricFit, with_changes: bool = True) -> list[Finding]:
-    """Return findings on each block: systematic residuals, and `with_changes` rows that fit worse than the others."""
+    """Return findings on each block: systematic residuals; if `with_changes`, also a set-up changed while measuring."""
     findings: list[Finding] = []
     for block, part in _lengths(fit):
         # pairs of rows count once
@@ -141,7 +141,7 @@ def neighbour_floor(q: np.ndarray, part: ResidualPart) -> float | None:
     """Return the rms of residual differences between nearest neighbours in q, over √2 [m]: an estimate of the noise.
 
     (von Neumann's mean square successive difference, 1941, with neighbours in joint space in place of time.) None where
-    neighbours are further apart than a third of the joints' spread, so that they share nothing.
+    neighbours are further apart than a third of the joints' spread: their systematic errors are unrelated.
     """
     spread = q.std(axis=0)
     moving = spread > 1e-9
@@ -163,9 +163,9 @@ class Scale:
     """Scale factor of all measured lengths, fitted together with the nominal arm's base and tool placement.
 
     Attributes:
-        factor: measured over the arm's.
-        sigma: of the factor.
-        explained: share of the squares of the nominal arm's errors that it takes away.
+        factor: measured lengths divided by the arm's nominal lengths.
+        sigma: standard deviation of the factor.
+        explained: share of the sum of squared errors of the nominal arm that the factor removes.
     """
 
     factor: float
@@ -178,12 +178,12 @@ def scale_of(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> Scale
 
     y - p = (s - 1) (p - mean p), with p the predicted positions, up to what placements explain.
 
-    None, too, where placements explain a growth of all lengths: it moves the targets by less than `MIN_LENGTH` per unit
-    (rms) otherwise.
+    None, too, where placements alone explain a growth of all lengths: beyond them it moves the targets by less than
+    `MIN_LENGTH` per unit (rms).
 
     Args:
         nominal: the arm with base and tool placement fitted for it.
-        blocks: of any kinds; those that measure positions count.
+        blocks: measurements; only blocks with positions are used.
     """
     frames = layout(nominal).frame_index
     residuals, columns = [], []
@@ -220,7 +220,8 @@ def scale_of(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> Scale
 def length_factor(fit: GeometricFit) -> Scale | None:
     """Return the common factor of fitted over nominal arm lengths; None for fewer than two fitted lengths.
 
-    Its sigma follows from the measurements; the explained share of the lengths' change shows whether it is one factor.
+    The factor's sigma follows from the measurements; `explained` shows whether one factor accounts for the lengths'
+    changes.
     """
     chain = fit.start.chain
     if fit.split is None:
@@ -257,9 +258,9 @@ def wrong_columns(nominal: Installation, blocks: Blocks, mirrored: bool = False)
     """Return the change of columns that reduces the nominal arm's error most; None if no change helps much.
 
     Args:
-        nominal: the arm as it was, placed.
-        blocks: the rows.
-        mirrored: whether an instrument with left-handed axes is tried, too.
+        nominal: the nominal arm, with stations and tools placed.
+        blocks: the measurements.
+        mirrored: whether to try an instrument with left-handed axes, too.
     """
     chain = nominal.chain
     n = chain.n
@@ -300,8 +301,8 @@ def wrong_angles(nominal: Installation, blocks: Blocks) -> Explanation | None:
     """Return the convention of the orientations' angles that reduces the nominal arm's error most; None if none does.
 
     Args:
-        nominal: the arm as it was, placed.
-        blocks: the rows.
+        nominal: the nominal arm, with stations and tools placed.
+        blocks: the measurements.
     """
     few = [block for block in _few(blocks) if isinstance(block, Poses) and block.euler]
     stated = {block.euler for block in few}
@@ -318,7 +319,7 @@ def wrong_angles(nominal: Installation, blocks: Blocks) -> Explanation | None:
 def _median_angle(nominal: Installation, blocks: Blocks) -> np.ndarray:
     """Return the median squared orientation error [rad²] (1,) with base and tool placement fitted.
 
-    Of most rows, since angles beyond the range of the stated convention were lost when they were read.
+    The median, since angles beyond the range of the stated convention were lost when the file was read.
     """
     try:
         placed = polish_frames(install(nominal.chain, blocks, nominal.known), blocks, ROBUST).cell
@@ -336,14 +337,16 @@ def _few(blocks: Blocks) -> Blocks:
 
 
 def _turned(joint: int, angle: float, blocks: Blocks) -> Blocks:
-    """Return blocks whose zero of a joint is another one."""
+    """Return the blocks with `angle` [rad] added to the values of one joint."""
     turn = np.zeros(blocks[0].q.shape[1])
     turn[joint] = angle
     return [replace(block, q=block.q + turn) for block in blocks]
 
 
 def _end_without(chain: Chain, joint: int) -> str | None:
-    """Return the option that ends the chain of a URDF before its last joint, or begins it behind its first one."""
+    """Return the option of a command that ends a URDF's chain before its last joint or begins it behind its first; or
+    None.
+    """
     if not chain.links or chain.n == 1:
         return None
     options = {0: f"--base {chain.links[0]}", chain.n - 1: f"--tip {chain.links[-2]}"}
@@ -382,7 +385,7 @@ def _read_as(euler: str, blocks: Blocks) -> Blocks:
 def _mean_square(nominal: Installation, blocks: Blocks) -> np.ndarray:
     """Return the mean squared error of the nominal arm [m²] after fitting base and tool placement.
 
-    A placement that was found worse than the one that `nominal` has does not count.
+    Where the fitted placement is worse than the one in `nominal`, the latter is used.
     """
     squares = [np.inf]
     # a second target has no placement yet

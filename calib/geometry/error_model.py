@@ -2,14 +2,15 @@
 
     E |e(q)|² = κ trace J Σ Jᵀ + s(q) v_0 + v_1 d(q)² + v_2 g(q)²
 
-with Σ the parameters' covariance, d the distance of q from the nearest pose of the fit and g that from
-the ranges of single joints that were, every joint counting by its lever [m]. s says where errors are larger than
-elsewhere (`calib.geometry.left_out`). κ and v are the most probable ones of errors on held-out rows: at
-random (near), by regions or stations, and by the ends of every joint's range (far); both kinds count alike. The radius
-that holds 95 % comes of the same rows' errors in units of that sigma (`calib.geometry.left_out`): nothing
-is said of their distribution. It goes from that of the near rows to that of the far ones as d² + g² goes from the
-median of the ones to that of the others, and is larger outside the range of a joint, by what that end of it showed when
-it was left out; sigmas are stated in units of the larger radius.
+with Σ the parameters' covariance, d the distance of q from the nearest pose of the fit and g the distance of q from the
+ranges of single joints in that fit, every joint multiplied by its lever [m/rad]. s is the factor of variance by which
+errors are larger at q than elsewhere (`calib.geometry.left_out`). κ and v are the most probable values given the errors
+on held-out rows: rows held out at random (near), and by regions or stations or the ends of every joint's range (far);
+near and far errors have equal weight. The radius that contains 95 % of the errors is a quantile of the same rows'
+errors in units of sigma (`calib.geometry.left_out`), without an assumed distribution. It changes from the near rows'
+quantile to the far rows' quantile as d² + g² goes from the median of the near rows to that of the far rows. Outside the
+range of a joint it is larger, by the factor observed when that end of the range was held out. Sigmas are stated in
+units of the larger radius.
 """
 
 from collections.abc import Iterator, Sequence
@@ -59,13 +60,13 @@ class Discrepancy:
     Attributes:
         parameters: κ, the factor of the variance due to the parameters.
         floor: v_0 [m²], error variance at the fitted poses for s = 1, with the instrument's noise.
-        far: v_1 [m²/m²], per squared distance from the nearest of them.
-        beyond: v_2 [m²/m²], per squared distance from the ranges of their joints.
+        far: v_1 [m²/m²], error variance per squared distance from the nearest fitted pose.
+        beyond: v_2 [m²/m²], error variance per squared distance from the fitted ranges of the joints.
         radii: number of sigmas that contained 95 % of the errors on held-out rows, near and far.
-        reach: median of d² + g² of the near rows, and of the far ones [m²].
-        levers: (n,) by how much the tool moves with each joint [m/rad or 1], rms over the poses.
+        reach: median of d² + g² over the near rows, and over the far rows [m²].
+        levers: (n,) motion of the tool per unit of each joint [m/rad or 1], rms over the poses.
         profile: log s by joint; empty for equal errors everywhere.
-        placed: the radii if base and tool are fitted to the rows; None if equal to `radii`.
+        placed: `radii` for rows to which base and tool are fitted; None if equal to `radii`.
         wider: widening factors of the interval below and above each joint's range; empty if unknown.
     """
 
@@ -92,7 +93,8 @@ class ErrorModel:
 
     Attributes:
         cell: the installation.
-        free, covariance: of its parameters (`calib.geometry.observation`).
+        free, covariance: positions of the fitted parameters in the full vector, and their covariance
+            (`calib.geometry.observation`).
         learnt: (m, n) poses of the fit [rad or m].
         discrepancy: see `Discrepancy`.
     """
@@ -104,12 +106,12 @@ class ErrorModel:
     discrepancy: Discrepancy
 
     def position_sigma(self, rows: PoseMeasurements, station: int = 0, tool: np.ndarray | int = 0) -> np.ndarray:
-        """Return the expected tool position error (m,) [m] at poses: its standard deviation, all axes together.
+        """Return the expected tool position error (m,) [m] at poses: the standard deviation, all axes together.
 
         Args:
             rows: joint values (m, n), and gravity torques for compliance terms.
             station: index of the station of reference; -1 for the arm's base.
-            tool: which of its tools, one or (m,).
+            tool: index of the tool, one or (m,).
         """
         variance = position_variances(self.cell, rows, self.free, self.covariance, station, tool)
         sigma, radius = self._sigma_and_radius(variance, rows.q, self.discrepancy.radii)
@@ -119,10 +121,10 @@ class ErrorModel:
         """Return `position_sigma` at the poses of measured rows (m,) [m].
 
         Args:
-            cell: the installation that predicts them: that of the fit, or one placed anew.
-            block: m rows.
-            placed_anew: whether base and tool were placed on these very rows; then errors that a placement takes up
-                do not count.
+            cell: the installation whose predictions are judged: that of the fit, or one placed anew.
+            block: the block of m rows.
+            placed_anew: whether base and tool were placed on these very rows; then errors that a placement can
+                compensate are excluded.
         """
         ready = prepare(cell, [block])[0]
         if not placed_anew:
@@ -152,12 +154,12 @@ class ErrorModel:
     def _sigma_and_radius(
         self, parameter_variance: np.ndarray, q: np.ndarray, radii: tuple[float, float]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the standard deviation (m,) [m] and the number of them (m,) that holds 95 % of the errors.
+        """Return the standard deviation (m,) [m] of each error, and how many of them (m,) contain 95 % of the errors.
 
         Args:
-            parameter_variance: (m,) [m²] due to the parameters, trace J Σ Jᵀ.
+            parameter_variance: (m,) error variance [m²] due to the parameters, trace J Σ Jᵀ.
             q: (m, n) poses [rad or m].
-            radii: near and far.
+            radii: the 95 % radii of near and far errors.
         """
         model = self.discrepancy
         from_poses, from_ranges = _distances(q, self.learnt, np.array(model.levers))
@@ -168,7 +170,7 @@ class ErrorModel:
         return sigma, np.interp(from_poses + from_ranges, model.reach, radii)
 
     def _widening(self, q: np.ndarray) -> np.ndarray:
-        """Return the widening factors (m,) of intervals outside the ranges: in full beyond half the width of an end."""
+        """Return the factors (m,) by which intervals widen outside the joints' ranges."""
         result = np.ones(len(q))
         for joint, (below, above) in enumerate(self.discrepancy.wider):
             levels = [0.0, END_SHARE, 1.0 - END_SHARE, 1.0]
@@ -187,7 +189,7 @@ def outside(q: np.ndarray, learnt: np.ndarray) -> np.ndarray:
 
 
 def _widened(distance: np.ndarray, width: float, factor: float) -> np.ndarray:
-    """Return the widening (m,) of intervals at distances behind the end of a range: `factor` beyond half its width."""
+    """Return the widening (m,) at `distance` beyond the end of a range: `factor` from half of `width` on."""
     share = np.clip(2.0 * distance / max(width, 1e-9), 0.0, 1.0)
     return 1.0 + (factor - 1.0) * share
 
@@ -213,8 +215,8 @@ def _variances(precision: np.ndarray, columns: np.ndarray) -> np.ndarray:
 def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the squared distances (m,) [m²] of poses from the nearest fitted pose, and from each joint's range.
 
-    The latter is, joint by joint, the distance within which `NEAR_SHARE` of the fitted poses are: a few of them far off
-    the others do not say how a joint is there.
+    The distance from a joint's range is that within which `NEAR_SHARE` of the fitted poses are: a few poses far from
+    the others do not determine the error of a joint there.
     """
     nearest = KDTree(learnt * levers).query(q * levers)[0]
     count = len(learnt)
@@ -253,12 +255,12 @@ def learn_errors(selection: ModelSelection, measured: Sequence[PoseMeasurements]
     """Return the error model, estimated from the errors on held-out rows; None if too few positions were measured.
 
     For every fold the geometry and the ridges of all chosen effects are estimated anew: ridges from all rows would
-    depend on the held-out rows. With a robust loss, rows beyond `MAX_RESIDUAL` robust sigmas do not count.
+    depend on the held-out rows. With a robust loss, rows beyond `MAX_RESIDUAL` robust sigmas are ignored.
 
     Args:
         selection: the model and its fit of all rows.
         measured: the blocks it was fitted to.
-        seed: of the random folds.
+        seed: seed of the random folds.
     """
     fit = selection.fit
     poses = sum(len(block) for block in measured)
@@ -315,15 +317,15 @@ class _Rows:
     """Residuals and Jacobians of a fit's rows at the rigid geometry, from which folds are evaluated.
 
     Attributes:
-        chosen: per block, the rows by which folds are judged.
-        measured: these rows.
+        chosen: per block, the numbers of the rows by which folds are judged.
+        measured: per block, the measurements of the chosen rows.
         pose: per block, (m,) number of each row's pose.
         poses: (p, n) joint values of all poses.
         counts: per block, (m,) mask of the rows that are not gross.
-        free: parameters of the fit but its corrections, then all terms on offer.
+        free: positions of the fit's parameters without its corrections, then of all offered terms.
         station: positions of the stations' placements among `free`.
-        prior: standard deviations of parameters that a fold does not tell.
-        coordinates: of the columns, in which the statistics are.
+        prior: standard deviations about the optimum, for parameters that a fold does not determine.
+        coordinates: coordinates of the columns in which the statistics are expressed.
         whitened: per block and residual part, residual and Jacobian.
         metric: per block, residual and Jacobian of positions [m].
         total: statistics of all rows.
@@ -412,7 +414,7 @@ class _Rows:
         return sum(statistics[1:], statistics[0])
 
     def left_out(self, folds: Folds, levers: np.ndarray) -> Iterator[np.ndarray]:
-        """Yield each fold's rows (rows, 5): |e|², trace J Σ Jᵀ, two squared distances to other rows, pose number."""
+        """Yield an array (rows, 5) per fold: |e|², trace J Σ Jᵀ, two squared distances to other rows, pose number."""
         space = self.coordinates
         diagonal = np.arange(len(self.prior))
         sizes = space.sizes

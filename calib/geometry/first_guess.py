@@ -3,15 +3,15 @@
 With the arm's poses A_i = (R_i, a_i) from the nominal chain:
 
 * full pose  B_i = S A_i X: rotations by Shah (2013, "Solving the robot-world/hand-eye calibration problem using the
-  Kronecker product"), then the two translations linearly; or, where poses hold nearly one orientation, which leaves
-  these open, by turns and ways together;
+  Kronecker product"), then the two translations linearly; or, where the orientations differ too little for that, from
+  rotations and displacements together;
 * position   S⁻¹ y_i = R_i t + a_i: linear in S's rotation (9 numbers), its offset and t; the 9 are projected on SO(3);
 * sockets    R_i t + a_i constant within each group: linear in t;
-* images     as the room for cameras registers it.
+* images     `calib.geometry.camera.camera_guess`.
 
 Each guess then gets a few robust Gauss–Newton steps on the frames alone (`calib.geometry.fit`).
 
-The nominal arm also shows units and orientations that cannot be right. A quaternion read in another order is still a
+The nominal arm also reveals wrong units and orientations. A quaternion read in another order is still a
 quaternion, and of two rows the angle |log R_iᵀ R_j| = 2 acos |q_i · q_j| does not depend on the order. But to move the
 w is an odd permutation, a reflection of the quaternions' sphere, so that what is read is P R_iᵀ Q with constant P, Q:
 an inverse, which no placement S, X brings to the arm's S A_i X.
@@ -101,7 +101,14 @@ Guess = tuple[np.ndarray | None, np.ndarray]
 
 
 def misfit(arm: np.ndarray, measured: np.ndarray, station: np.ndarray, tool: np.ndarray, lever: float) -> np.ndarray:
-    """Return the distances (m,) [m] between measured poses B_i and predicted poses S A_i X of the target."""
+    """Return the distances (m,) [m] between measured poses B_i and predicted poses S A_i X of the target.
+
+    Args:
+        arm: (m, 4, 4) A_i, poses of the tip in the base.
+        measured: (m, 4, 4) B_i, poses of the target in the station's frame.
+        station, tool: S and X (4, 4).
+        lever: length by which angles [rad] are multiplied [m].
+    """
     distance, turn = _differences(station @ arm @ tool, measured)
     return np.hypot(distance, lever * turn)
 
@@ -152,11 +159,11 @@ def by_orientations(arm: np.ndarray, measured: np.ndarray) -> Placements:
 
 
 def _by_displacements(arm: np.ndarray, measured: np.ndarray) -> Placements:
-    """Return S and X from rotations and displacements about the mean: accurate for a line with one orientation.
+    """Return S and X (4, 4) from rotations and displacements about the mean: accurate even for nearly one orientation.
 
     log(R_B,i R̄_Bᵀ) = R_S log(R_A,i R̄_Aᵀ), the chordal means being turned in the same way, and
-    y_i - ȳ = R_S (a_i - ā + (R_i - R̄) t): R_S by Kabsch on both, turns at a lever of `LEVER`, and t by its linear
-    solution, in turns.
+    y_i - ȳ = R_S (a_i - ā + (R_i - R̄) t): R_S by Kabsch on both, rotations multiplied by `LEVER` [m], alternating with
+    the linear solution for t.
     """
     arm_mean, arm_turns = chordal_turns(arm[:, :3, :3])
     measured_mean, measured_turns = chordal_turns(measured[:, :3, :3])
@@ -223,15 +230,15 @@ def check_orientations(chain: Chain, block: PoseMeasurements) -> None:
 
 
 def _misfit(arm: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> tuple[float, float]:
-    """Return the differences of measured and predicted poses after placing instrument and tool as well as possible.
+    """Return the differences of measured and predicted poses after fitting the placements of instrument and tool.
 
     Args:
         arm: (m, 4, 4) poses of the tip in the base.
-        position: (m, 3) [m].
-        quaternion: (m, 4) x y z w.
+        position: (m, 3) measured positions [m].
+        quaternion: (m, 4) measured orientations, x y z w.
 
     Returns:
-        The median angle [deg], and the median distance over the positions' spread.
+        The median angle [deg], and the median distance divided by the positions' spread.
     """
     measured = from_quaternion(position, quaternion)
     station, tool = place_pose(arm, measured)
@@ -243,12 +250,12 @@ def _misfit(arm: np.ndarray, position: np.ndarray, quaternion: np.ndarray) -> tu
 def install(chain: Chain, measured: Sequence[PoseMeasurements], known: Deflection | None = None) -> Installation:
     """Return the nominal arm with its stations and tools placed by a first guess from the measurements.
 
-    A tool seen in several blocks takes its guess from the block that constrains most (poses before positions before the
-    rest, then the one whose poses turn most, then the most rows); a station likewise. Tools that no block can place
-    start at the tip.
+    A tool seen in several blocks takes its guess from the block that constrains most (poses before positions before
+    other kinds, then the block whose poses rotate most, then the one with most rows); a station likewise. Tools that no
+    block can place start at the tip.
 
     Raises:
-        MeasurementError: too few rows to place an instrument.
+        MeasurementError: if there are too few rows to place an instrument.
     """
     foreign = [block for block in measured if block.kind not in KINDS]
     optics = NoOptics()
@@ -294,7 +301,7 @@ def check_scale(block: PoseMeasurements, chain: Chain) -> None:
 
     Args:
         block: measurements; those without positions pass.
-        chain: predicts them from the joints.
+        chain: the nominal arm, which predicts the positions.
 
     Raises:
         MeasurementError: for a ratio beyond `max_ratio`, with the units that would explain it; for positions on a
@@ -365,7 +372,14 @@ def _turning(chain: Chain, block: PoseMeasurements) -> float:
 def guess(
     block: PoseMeasurements, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> Guess:
-    """Return the placements of station and tool for one target; those already guessed stay."""
+    """Return the placements of station and tool for one target; a placement that is given is kept.
+
+    Args:
+        block: measurements.
+        arm: poses (4, 4) of the tip in the base, one per row.
+        rows: the target's rows in the block.
+        station, tool: (4, 4) placements known already; None for those to guess.
+    """
     arm = arm[rows]
     if isinstance(block, Positions):
         min_poses = 3 if isinstance(block, Poses) else 4
@@ -400,8 +414,8 @@ def _place_position(
     the smallest median error is taken, since a small workspace ruins the linear one.
 
     Args:
-        arm: (m, 4, 4).
-        measured: (m, 3) [m].
+        arm: (m, 4, 4) poses A_i of the tip in the base.
+        measured: (m, 3) measured positions y_i [m].
     """
     rotation = arm[:, :3, :3]
     position = arm[:, :3, 3]
@@ -433,7 +447,7 @@ def _median_offset(rotation: np.ndarray, lever: np.ndarray) -> np.ndarray:
 
 
 def _linear_offset(rotation: np.ndarray, position: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Return t of R_Sᵀ y - c - R t = a, linear in the nine numbers of R_Sᵀ, c and t."""
+    """Return the offset t (3,) [m] that solves R_Sᵀ y - c - R t = a, linear in the nine numbers of R_Sᵀ, c and t."""
     m = len(measured)
     centre = measured.mean(axis=0)
     rows = np.zeros((m, 3, 15))

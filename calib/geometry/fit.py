@@ -66,25 +66,24 @@ def fit(
 ) -> GeometricFit:
     """Return the most probable geometry: all candidate parameters of the arm, each with a prior of making.
 
-    Minimises Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / w)². Nothing of the arm is selected: parameters that merge
-    share what the measurements say of them, and those that the measurements do not determine stay near nominal. The
-    widths w of making, one for joint offsets, one for other angles and one for lengths, maximise the evidence (MacKay
-    1992). Placements have no prior: of them the base columns are fitted, and what of the arm only displaces them stays
-    at nominal. What is identifiable is read off afterwards
-    (`GeometricFit.split`, `GeometricFit.base_sigma`).
+    Minimises Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / w)². No parameter of the arm is selected: parameters that merge
+    share the effect that the measurements determine, and undetermined ones stay near nominal. The widths w of making,
+    one for joint offsets, one for other angles and one for lengths, maximise the evidence (MacKay 1992). Placements
+    have no prior: only their base columns are fitted, and arm parameters that merely displace base or tool stay at
+    nominal. The identifiable parameters are computed afterwards (`GeometricFit.split`, `GeometricFit.base_sigma`).
 
     Args:
-        cell: where to start; frames placed (`calib.geometry.first_guess`).
+        cell: installation to start from, with frames placed (`calib.geometry.first_guess`).
         measured: blocks of measurements.
         candidates: (c,) positions in the parameter vector; None for all.
         settings: see `Settings`.
-        prior: stated standard deviations of the whole parameter vector about its present values; infinite for those of
-            making.
-        widths: estimate the widths of making; False for `PLAUSIBLE`.
+        prior: standard deviations of the whole parameter vector about its present values; infinite where the prior of
+            making applies; None for making everywhere.
+        widths: whether to estimate the widths of making; False to use `PLAUSIBLE`.
 
     Raises:
-        MeasurementError: fewer rows than identifiable parameters.
-        Unidentifiable: the rows determine no parameter.
+        MeasurementError: if there are fewer rows than identifiable parameters.
+        Unidentifiable: if the rows determine no parameter.
     """
     settings = settings or Settings()
     table = layout(cell)
@@ -137,11 +136,11 @@ def _require_enough(cell: Installation, blocks: list[Block], unknowns: int) -> N
 def plain_fit(cell: Installation, measured: Sequence[PoseMeasurements]) -> GeometricFit | None:
     """Return the plain reference: all parameters, the widest priors of making, every row with the same weight.
 
-    Nothing is estimated beside the parameters and the noise, nothing selected: what an hour of SciPy gives. Results are
-    held against it. None where the rows are too few.
+    Only the parameters and the noise are estimated, and nothing is selected, as a short script on SciPy would do. Other
+    results are compared with it. None if there are too few rows.
 
     Args:
-        cell: nominal arm, frames placed.
+        cell: the nominal arm, with frames placed.
         measured: blocks of measurements.
     """
     try:
@@ -151,9 +150,9 @@ def plain_fit(cell: Installation, measured: Sequence[PoseMeasurements]) -> Geome
 
 
 def _estimated(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -> np.ndarray:
-    """Return the parameters to estimate: those of the arm that have an effect, and the base columns of the others.
+    """Return the parameters to estimate: those of the arm that have an effect, and the base columns of all others.
 
-    Parameters of the arm that do no more than displace base or tool stay at nominal: that is what these frames are.
+    Parameters of the arm that only displace base or tool stay at nominal: those frames account for them.
     """
     arm = layout(cell).index("arm")
     in_arm = np.isin(candidates[split.kept], arm)
@@ -168,8 +167,8 @@ def _estimated(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -
 def _scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -> np.ndarray:
     """Return the arm's longest length and the parameters that merge with it; empty for an arm without lengths.
 
-    Sockets and planes are as well explained by a smaller arm, in the limit by none at all, so that the scale has to
-    come from the nominal: this length stays, and what can replace it stays with it.
+    A smaller arm explains sockets and planes as well, so that the scale has to come from the nominal arm: the longest
+    length keeps its nominal value, as do the parameters that could replace it.
     """
     lengths = np.zeros(len(candidates))
     for column, parameter in enumerate(candidates):
@@ -194,11 +193,12 @@ def _scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndar
 
 
 def _depend_by_scale(lengths: np.ndarray, split: ColumnSplit) -> np.ndarray:
-    """Return which dropped columns (p - b,) depend on the kept ones as one factor on all lengths makes them depend.
+    """Return a mask (p - b,) of the dropped columns that depend on the kept ones as under a common factor on all
+    lengths.
 
     Args:
-        lengths: (p,) of the candidate columns [m]; zero for those that are none.
-        split: of the candidate columns.
+        lengths: (p,) values of the candidate columns that are lengths [m]; zero for others.
+        split: the split of the candidate columns into b base columns and dropped ones.
     """
     base_lengths = lengths[split.kept]
     lengths_kept = base_lengths != 0.0
@@ -229,7 +229,7 @@ def _making(
         blocks: measurements prepared for it.
         free: (f,) positions in the parameter vector.
         prior: (f,) standard deviations to begin with; infinite for none.
-        has_stated_prior: (f,) mask of those that stay.
+        has_stated_prior: (f,) mask of the parameters whose prior was stated and stays.
         settings: see `Settings`.
     """
     sample = _sample(cell, blocks, _sampled_rows(blocks, len(free)))
@@ -264,14 +264,14 @@ def _most_probable_widths(
     """Return the prior (f,) with the most probable width of each family, by MacKay's fixed point (1992).
 
     w² = (Σ x² + w_0²) / (Σ γ + 1), with γ = 1 - σ² / w² the share that the data determine of a parameter: `typical`
-    counts as one more parameter of the family, and decides where the data say nothing of it (our choice).
+    counts as one more parameter of the family, and decides where the data do not determine w (our choice).
 
     Args:
-        data: whitened statistics about nominal, (f, f).
+        data: whitened statistics (f, f) of the rows, parameters counted from nominal.
         family: (f,) family of each parameter; -1 for a width that stays.
         prior: (f,) widths to begin with; infinite for none.
-        widest: (f,) widths at most.
-        typical: (f,) widths w_0.
+        widest: (f,) upper bounds of the widths.
+        typical: (f,) widths w_0 of a typical arm.
     """
     width = prior.copy()
     scale = 1.0 / np.sqrt(np.maximum(np.diag(data.square), 1e-300))
@@ -293,7 +293,7 @@ def _most_probable_widths(
 
 
 def _making_families(cell: Installation, free: np.ndarray, has_stated_prior: np.ndarray) -> np.ndarray:
-    """Return the family (f,) of each parameter: joint offsets, other angles, lengths, numbered; -1 for no width."""
+    """Return each parameter's family (f,): joint offsets, other angles, lengths; -1 for no width of making."""
     kinds = np.where(has_stated_prior, "", families(cell)[free])
     family = np.full(len(free), -1)
     number = 0
@@ -316,17 +316,17 @@ def fit_with_prior(
 ) -> GeometricFit:
     """Return the fit of exactly the parameters `free`: min Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / σ_prior)².
 
-    Sigmas that no file states are estimated, one per file and nature (position, orientation …), and the fit repeated
-    until they settle; so are the weights of a robust loss. Thousands of poses begin where a sample of them ends.
+    Sigmas that no file states are estimated, one per file and kind of residual (position, orientation …), and the fit
+    is repeated until sigmas and robust weights settle. With thousands of poses the fit starts from that of a sample.
 
     Args:
-        cell: where to start.
+        cell: installation to start from.
         blocks: measurements prepared for this installation.
         free: (f,) positions in the parameter vector.
         prior: (f,) standard deviations; infinite for none.
         settings: see `Settings`.
         nominal: mean of the prior; None for `cell`.
-        warm: `cell` is a fit already, so that its residuals tell the sigmas to begin with.
+        warm: whether `cell` is fitted already, so that its residuals give the first sigmas.
     """
     settings = settings or Settings()
     state = cell
@@ -361,12 +361,12 @@ def fit_with_prior(
 def plausible_deviation(
     cell: Installation, columns: np.ndarray, deviations: Mapping[str, float] = PLAUSIBLE
 ) -> np.ndarray:
-    """Return how far each parameter may be from nominal by making (c,); infinite for frames and deflections.
+    """Return the plausible manufacturing deviation (c,) of each parameter; infinite for frames and deflections.
 
     Args:
         cell: the installation.
         columns: (c,) positions in the parameter vector.
-        deviations: of an arm's parameter, by its unit: `PLAUSIBLE`, or `TYPICAL` of a usual arm.
+        deviations: deviation of an arm's parameter, by unit: `PLAUSIBLE`, or `TYPICAL` of a usual arm.
     """
     table = layout(cell)
     result = np.full(len(columns), np.inf)
@@ -386,8 +386,8 @@ def polish_frames(
 def placed_on(cell: Installation, block: PoseMeasurements, settings: Settings) -> GeometricFit:
     """Return the arm with base and tool placement fitted to one block, arm and deflections unchanged.
 
-    Where that does not settle, since the block hardly identifies some of it (the turn about a line that is driven),
-    what it identifies by less than `MIN_COLUMN` stays where it is. Whether that settled is the solution's status.
+    If that fit does not converge because the block hardly identifies some direction (the rotation about a straight line
+    of poses), directions with columns below `MIN_COLUMN` are kept. The solution's status states whether it converged.
     """
     start = install(cell.chain, [block], cell.known)
     start = replace(start, deflection=cell.deflection, optics=start.optics.like(cell.optics))

@@ -52,7 +52,9 @@ class NoOptics:
         return self
 
     def view(self, measured: PoseMeasurements, free: np.ndarray) -> View | None:
-        """Return what these instruments add to a block's prediction; `free` counts from their first parameter."""
+        """Return what these instruments add to a block's prediction; here None. `free` counts from the optics' first
+        parameter.
+        """
         return None
 
     def tables(self) -> Mapping[str, object]:
@@ -116,7 +118,7 @@ class Seen:
         walked: the pass along the chain, in the station's frame.
         point: (3, m) target positions [m].
         rotation: (3, 3, m) target rotations, ``rotation[c]`` being column c.
-        view: of images, what of camera and board they are predicted with; None for other instruments.
+        view: camera and board with which images are predicted; None for other instruments.
     """
 
     walked: Sweep
@@ -195,13 +197,13 @@ def read(path: str | Path) -> Installation:
 
 
 def read_arms(path: str | Path) -> tuple[Installation, Installation]:
-    """Return the calibrated arm of a fit (see `read`), and its nominal arm.
+    """Return the calibrated arm of a fit (see `read`) and the nominal arm that it started from.
 
-    The nominal one has the frames that let it fit the same measurements best. Without them (of an earlier version's fit
-    that started from an earlier fit's folder) it has no stations and no tools.
+    The nominal arm has the frames with which it fits the same measurements best; if the file lacks them (an earlier
+    version's fit that started from another fit) it has no stations and no tools.
 
     Raises:
-        RobotError: where the file does not say which arm that was.
+        RobotError: if the file does not name the nominal arm.
     """
     robot, extra = calibrated.read_whole(path)
     provenance = extra.get("provenance", {})
@@ -218,7 +220,7 @@ def _placed(
 ) -> Installation:
     """Return a chain with the stations and tools of the tables; identity frames for an empty list.
 
-    `source`: of the tables, with which messages begin.
+    `source`: name of the tables' file, with which messages begin.
     """
     with refused_as(RobotError, ValueError, f"{source}: {{}}; expected [[...]] tables, each with a name, xyz and rpy"):
         frames = read_record(_Frames, tables)
@@ -238,7 +240,7 @@ def _placed(
 
 
 def _placements(entries: tuple[Mapping[str, object], ...], source: str) -> tuple[tuple[str, ...], np.ndarray]:
-    """Return names and placements (k, 4, 4) of the entries of a table; without a name their number."""
+    """Return names and placements (k, 4, 4) of a table's k entries; an unnamed entry is named by its number."""
     names = []
     placements = []
     for number, entry in enumerate(entries, 1):

@@ -4,9 +4,9 @@ Damped Gauss–Newton (Levenberg 1944) on  e(q) = [p* - p(q);  L · log(R* R(q)�
 
     step = Jᵀ (J Jᵀ + λ I)⁻¹ e
 
-J is that of the deflected arm, without the deflections' own slope ∂δ/∂q: some 1e-3, so that each step still takes
-two to three digits. Steps of least norm leave the configuration alone; joints at a limit stay there while they would
-go beyond.
+J is the Jacobian of the deflected arm without the deflections' derivative ∂δ/∂q, which is about 1e-3: each step still
+gains two to three digits. Steps of least norm keep the configuration; a joint at a limit stays at it while its step
+would exceed it.
 """
 
 from collections.abc import Callable
@@ -59,7 +59,7 @@ class Goal:
 
 
 def seen_at(goal: Goal, q: np.ndarray) -> Seen:
-    """Return the tool poses (m, 4, 4) at joint values q (m, n), deflections included."""
+    """Return the tool poses at joint values q (m, n), deflections included, in the station's frame."""
     deflection = goal.cell.deflection
     torque = None
     if goal.torques is not None and any(term.basis == "torque" for term in deflection.terms):
@@ -71,7 +71,7 @@ def differences(goal: Goal, q: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """Return the differences of targets and tool poses (m, dof): position [m], then orientation [rad].
 
     dof 6: rotation vector of R* Rᵀ in the station's axes. dof 5: the turn that brings the tool's z axis onto the
-    target's, about the tool's x and y.
+    target's, about the tool's x and y; dof 3: positions only.
     """
     return _differences(seen_at(goal, q), targets, goal.dof)
 
@@ -188,7 +188,7 @@ def nearest(goal: Goal, targets: np.ndarray, start: np.ndarray, q: np.ndarray) -
     """Return the joint values (m, n) with the tool poses of `q` that are nearest to `start`, for a redundant arm.
 
     Minimises |q - q_start| (radians and metres alike) under e(q) = 0: each pass steps by d + J⁺ (e - J d), d = q_start
-    - q. A target at which that loses what `q` has reached keeps `q`.
+    - q. Where a target would no longer be reached, the result keeps `q`.
     """
     if q.shape[1] <= goal.dof:
         return q
@@ -212,7 +212,7 @@ def held_back(goal: Goal, targets: np.ndarray, start: np.ndarray, max_change: fl
     """Return joint values (m, n) near the targets with no joint more than `max_change` away from `start`.
 
     For targets near a singularity, where a small correction takes a large motion: minimises |e|² + μ² |q - q_start|²
-    with the smallest μ of `BACK` that keeps to `max_change` [rad or m].
+    with the smallest μ of `BACK` for which the change is at most `max_change` [rad or m].
     """
     best = np.clip(start, goal.lower, goal.upper)
     open_rows = np.arange(len(best))

@@ -1,6 +1,6 @@
 """Drive gains of a parallel robot from currents, by runs without and with a payload of known mass.
 
-Redundant actuators share the forces in proportions that no model knows. Known are the forces on the platform,
+Redundant actuators share the forces in proportions that no model determines. Determined are the forces on the platform,
 
     J_p^invᵀ diag(i) K = W χ + P χ_L,    an entry of χ_L known
 
@@ -10,7 +10,8 @@ m_r = Σ_k K_k² σ_k² mean(J_kr²), and
 
     min Σ_r ‖J_rᵀ diag(i) K - W_r χ - P_r χ_L‖² / m_r(K)
 
-is a total least squares: what noise adds to the sum does not depend on K. With m_r held, noise draws K towards zero.
+is a total least squares: what noise adds to the sum does not depend on K. With m_r constant, noise would bias K towards
+zero.
 """
 
 from collections.abc import Mapping, Sequence
@@ -44,17 +45,18 @@ def drive_gains(
     known_values: Mapping[str, float],
     reference: int | None,
 ) -> DriveGains:
-    """Return the drive gains of a parallel robot; their sigmas are the larger of the residuals' and a jackknife's.
+    """Return the drive gains of a parallel robot; each sigma is the larger one of the residuals' and of a jackknife.
 
-    The jackknife leaves out blocks of time (Efron & Tibshirani 1993, eq. 11.5) and sees part of what the model lacks.
+    The jackknife leaves out blocks of time (Efron & Tibshirani 1993, eq. 11.5) and so includes part of the model's
+    error.
 
     Args:
         cases: recordings whose targets (N, n) are the actuators' currents [A].
         known: parameters of payloads whose values are known, in SI.
-        reference: the joint relative to which gains are asked for where nothing is known.
+        reference: index of the joint to which gains would be relative without a known payload; refused here.
 
     Raises:
-        UsageError: without a known payload, and for one that no recording separates.
+        UsageError: without a known payload, or if no recording distinguishes the payload.
     """
     if reference is not None:
         raise UsageError(

@@ -1,4 +1,4 @@
-"""What a motion of a parallel robot is designed for: model, rows and columns, loads, an identification before it."""
+"""Design goal of a parallel robot's motion: model, rows and columns, loads, and an earlier identification as prior."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -34,8 +34,8 @@ class LoadedPlatform(PlatformRegressor):
     """Rows of a model (platform, motor or power) of one motion that is run once with each of several loads.
 
     Attributes:
-        names, units: of the columns, as an identification has them.
-        loads: payloads on board in each run.
+        names, units: names and units of the columns, as in an identification.
+        loads: payloads carried in each run.
     """
 
     names: tuple[str, ...] = ()
@@ -72,12 +72,12 @@ class LoadedPlatform(PlatformRegressor):
 
 @dataclass(frozen=True, eq=False)
 class Purpose:
-    """What a motion of a parallel robot is designed for.
+    """Design goal of a motion of a parallel robot.
 
     Attributes:
         model: rows as functions of the platform's coordinates, smoothed for the search, and exact.
-        columns: that count, and σ of the rows.
-        prior: of an identification that the motion adds to.
+        columns: columns to be identified, and σ of the rows.
+        prior: information of an earlier identification that the motion complements; None without one.
     """
 
     model: ExcitedModel
@@ -89,11 +89,11 @@ def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") 
     """Return a model of a robot with its values (p,): identified, or the file's inertias without friction.
 
     Args:
-        folder: of an identification; None: the robot's file, with the terms `drives` of each actuator.
+        folder: folder of an identification; None to use the robot's file, with the terms `drives` for each actuator.
 
     Raises:
-        RobotError: where the folder holds no model, or one of other bodies.
-        UsageError: where the robot's file has no inertias.
+        RobotError: if the folder contains no model, or a model of other bodies.
+        UsageError: if the robot's file has no inertias.
     """
     if folder is None:
         model = make_parallel_model(robot.mechanism, (drives,), v0=0.05)
@@ -127,7 +127,7 @@ def file_bodies(robot: ParallelMechanism, model: ParallelModel) -> np.ndarray:
     """Return the inertial parameters (inertial,) of a model by the robot's file.
 
     Raises:
-        UsageError: where the file has none.
+        UsageError: if the file has no inertias.
     """
     bodies = model.known_parameters()
     if bodies is None:
@@ -184,9 +184,9 @@ def purpose_of(
     folder: Path | None,
     after: Path | None,
 ) -> Purpose:
-    """Return the base columns of a model under some loads, with what an identification `after` knows of them.
+    """Return the design goal: a model's base columns under some loads, with the prior of the identification `after`.
 
-    After an identification its own columns count; those of payloads that no load has rest on it alone.
+    With `after` the columns are those of the identification; payloads that no load contains rest on the prior alone.
     """
     standard = model.names
     covariance = None
@@ -281,7 +281,7 @@ def _inverse(information: np.ndarray) -> np.ndarray:
 
 
 def whole(model: ParallelModel, values: np.ndarray) -> Purpose:
-    """Return the purpose of all base parameters, rows in units of what equal noise of all torques makes of them."""
+    """Return the purpose of all base parameters, with σ of the rows that follows from equal noise of all torques."""
     mechanism = model.mechanism
     base = bases.find(ParallelModel(mechanism, model.terms, rows_named(mechanism), ()))
     columns = np.array([model.names.index(base.standard[k]) for k in base.kept])

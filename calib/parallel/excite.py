@@ -61,9 +61,9 @@ class _ActuatorLimit(TwoSided):
     """Limit of each actuator's torque |τ| ≤ τ_max, or speed |q̇| ≤ v_max.
 
     Attributes:
-        plan: takes platform coordinates to the robot's motion.
-        of: the motion of N samples -> (N, n), what is limited.
-        limits: (n,), finite; rows: names of the n actuators.
+        plan: maps platform coordinates to the robot's motion.
+        of: maps a motion of N samples to the limited quantity (N, n).
+        limits: (n,) finite limits; rows: names of the n actuators.
         name, unit: of the limit.
     """
 
@@ -100,8 +100,8 @@ class ParallelExcitation(ExcitationDesign):
     """An exciting motion of a parallel robot; the fields of the design refer to the platform's coordinates.
 
     Attributes:
-        robot: with its file.
-        plan: takes platform coordinates to the robot's motion and torques.
+        robot: the robot, with its file.
+        plan: maps platform coordinates to the robot's motion and torques.
     """
 
     robot: ParallelMechanism
@@ -128,7 +128,7 @@ class ParallelExcitation(ExcitationDesign):
         return Setpoints(track.rate, q, v, a, self._torques(motion))
 
     def _torques(self, motion: LoopMotion) -> np.ndarray:
-        """Return the torques of the actuators (N, n), each of the load under which it is largest."""
+        """Return the torques of the actuators (N, n), for each the largest one over all loads."""
         torques = self.plan.torques(motion).reshape(len(motion.v), -1, self.robot.chain.n)
         heaviest = np.abs(torques).argmax(axis=1, keepdims=True)
         return np.take_along_axis(torques, heaviest, axis=1)[:, 0]
@@ -162,8 +162,8 @@ class ParallelExcitation(ExcitationDesign):
         """Return the periodic motion of the actuators as Fourier series.
 
         Args:
-            max_error: by which the series may leave the motion [rad or m].
-            samples: over the period, of which the series are made.
+            max_error: largest deviation of the series from the motion [rad or m].
+            samples: number of samples over the period from which the series are computed.
         """
         x, _, _ = self.orders(self.period / samples * np.arange(samples))
         robot = self.robot.chain
@@ -217,11 +217,11 @@ def excite_parallel(
             others are for serial arms.
         model: folder of an identification of the same robot, which predicts the torques and whose drive terms are to
             be identified; None: the file's inertias.
-        options: of the identification that will follow: rows, drives, friction of passive joints, payloads.
-        after: folder of an identification that the motion shall add to; it is the model, too.
+        options: options of the identification that will follow: rows, drives, friction of passive joints, payloads.
+        after: folder of an identification that the motion is to complement; it also serves as `model`.
 
     Raises:
-        UsageError: for options that only serial arms know.
+        UsageError: for options that apply to serial arms only.
     """
     refuse_unread(settings, DEFAULT_DESIGN, READ)
     for text in (*settings.goals, *settings.hard):
@@ -258,19 +258,19 @@ def design_parallel(
 ) -> ParallelExcitation:
     """Return a motion of the platform, optimised to identify the base parameters of a parallel robot.
 
-    The determinant of the information is optimised, rows in units of what equal noise of all torques makes of them at
-    home; `GUARD` of the torque limits stays free.
+    The determinant of the information is maximised, with σ of the rows as it follows at home from equal noise of all
+    torques; a share `GUARD` of the torque limits is kept in reserve.
 
     Args:
-        model: of the robot, with what it carries and the preload of redundant actuators.
+        model: model of the robot, with payloads and the preload of redundant actuators.
         values: (p,) parameters that predict the actuators' torques.
         settings: period, harmonics, starts, evaluations, seed, rate.
-        acceleration: (r,) limits of the coordinates' second derivatives; infinite where there is none.
-        purpose: what the motion is designed for; None: all base parameters, on the platform's coordinates.
+        acceleration: (r,) limits of the coordinates' second derivatives; infinite where there is no limit.
+        purpose: design goal; None: all base parameters, on the platform's coordinates.
 
     Raises:
-        UsageError: where nothing limits an actuator's speed or torque.
-        NothingFeasible: naming the limit that stands in the way.
+        UsageError: if an actuator's speed or torque has no limit.
+        NothingFeasible: if no motion keeps the limits; the message names the limit concerned.
     """
     mechanism = model.mechanism
     parallel_robot = model.mechanism.robot
@@ -300,7 +300,7 @@ def design_parallel(
 
 @dataclass(frozen=True)
 class _PlatformAxes:
-    """The coordinates of a platform as the joints of an arm, whose motion is searched for."""
+    """The platform's coordinates in the role of an arm's joints, whose motion is searched for."""
 
     robot: ParallelRobot
 
@@ -325,7 +325,7 @@ def actuator_bounds(mechanism: ClosedRobot) -> MotionBounds:
     """Return the limits of the actuators: speeds and efforts of the robot's file.
 
     Raises:
-        UsageError: where nothing limits one.
+        UsageError: if an actuator has no limit.
     """
     joints = mechanism.robot.joints
     velocity = np.array([joint.velocity for joint in joints])
@@ -337,7 +337,7 @@ def actuator_bounds(mechanism: ClosedRobot) -> MotionBounds:
 
 
 def check_motion_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Raise an error if an output folder has other content or contains an input file."""
+    """Raise UsageError if an output folder has other content or contains an input file."""
     check_target(out, MOTION, (METRICS, PLANNED), "motion", inputs)
 
 
@@ -353,8 +353,8 @@ def write_motion(
     """Write the folder of a motion: ``robot.toml``, ``motion.csv``, ``metrics.json`` and what `write_files` adds.
 
     Args:
-        track: of the actuators; coordinates: (N, r) of the platform; both stand in ``motion.csv``.
-        bounds: which the motion keeps; they stand at the head of the file.
+        track: setpoints of the actuators; coordinates: (N, r) of the platform; both are written to ``motion.csv``.
+        bounds: limits that the motion keeps, written at the head of the file.
     """
     parts = {"q": track.q, "v": track.v, "tau": track.tau}
     names = []

@@ -93,8 +93,8 @@ class OpenedRobot:
     """A parallel robot cut open for export, its masses consistent.
 
     Attributes:
-        model, values: its dynamics (p,), without payloads.
-        drives: of all joints of the tree.
+        model, values: dynamics model and its parameters (p,), without payloads.
+        drives: drive parameters of all joints of the tree.
     """
 
     model: ParallelModel
@@ -122,7 +122,7 @@ class OpenedRobot:
 
     @cached_property
     def chains(self) -> list[Chain]:
-        """The legs under names of their own, the last link of each rigid one with its share of the platform."""
+        """The legs as chains, uniquely named; the last link of each rigid leg has its share of the platform's mass."""
         robot = self.mechanism.robot
         rows = self.model.leg_parameters(self.values)
         names = [joint.name for leg in robot.legs for joint in leg.chain.joints]
@@ -251,7 +251,7 @@ class OpenedRobot:
 
 @dataclass(frozen=True, eq=False)
 class _Source:
-    """What an export is made of: the robot with its dynamics, all parameters as a table, and notes."""
+    """Input of an export: the robot with its dynamics, all parameters as a table, and notes."""
 
     opened: OpenedRobot
     parameters: dict[str, object]
@@ -260,7 +260,7 @@ class _Source:
 
 @dataclass(frozen=True, eq=False)
 class _ArmBodies:
-    """The bodies of a parallel robot as those of an arm: how many, of how many joints, labels, and joint of each."""
+    """The bodies of a parallel robot in an arm's form: number of bodies and joints, labels, joint of each body."""
 
     count: int
     n: int
@@ -270,7 +270,7 @@ class _ArmBodies:
 
 @dataclass(frozen=True, eq=False)
 class _ArmModel:
-    """What `find_possible` reads of the model of an arm."""
+    """The part of an arm's model that `find_possible` reads."""
 
     bodies: _ArmBodies
     columns: tuple[object, ...]
@@ -280,9 +280,9 @@ class _ArmModel:
 
 
 def _side_by_side(model: ParallelModel, bodies: np.ndarray | None) -> tuple[Chain, Any]:
-    """Return the bodies of a model in the form that `find_possible` reads of serial arms: parameters and labels alone.
+    """Return the bodies of a model in the form that `find_possible` requires (parameters and labels of a serial arm).
 
-    Bodies without known masses are rods of 1 kg each, a leg's between its joints.
+    Bodies without known masses become rods of 1 kg each, for a leg between its joints.
     """
     labels = tuple(name.removeprefix(STANDARD[0]) for name in model.names[: model.inertial : 10])
     count = len(labels) - len(model.payloads)
@@ -315,7 +315,7 @@ def _identified(robot: ParallelMechanism, folder: Path, prior: str) -> _Source:
     """Return the robot of an identification with physically consistent bodies.
 
     Raises:
-        RobotError: of an identification by an earlier version, which did not write how parameters regroup.
+        RobotError: for an identification by an earlier version, which did not store how parameters regroup.
     """
     refuse_currents(folder, "an export of masses")
     model, parameters = read_model(robot, folder)
@@ -364,7 +364,7 @@ def _calibrated(robot: ParallelMechanism, folder: Path) -> _Source:
     """Return a robot with the inertias of its file, without friction.
 
     Raises:
-        UsageError: where the file has none.
+        UsageError: if the file has no inertias.
     """
     model = make_parallel_model(robot.mechanism, ("",))
     bodies = model.known_parameters()
@@ -389,18 +389,18 @@ def _calibrated(robot: ParallelMechanism, folder: Path) -> _Source:
 
 
 def export_parallel(robot: ParallelMechanism, folder: Path, into: Path, prior: str = "entropic") -> tuple[str, ...]:
-    """Write a parallel robot with its dynamics for other programs; the files are those of the module.
+    """Write a parallel robot with its dynamics for other programs; the files are listed in the module's docstring.
 
     Args:
-        folder: of a fit or of an identification.
+        folder: folder of a fit or of an identification.
         into: folder for the files.
         prior: see `calib.export`.
 
     Returns:
-        What was written and what to know of it, in words.
+        Sentences on the files written, with remarks.
 
     Raises:
-        RobotError: where Pinocchio reads other loops or other forces; nothing is written.
+        RobotError: if Pinocchio computes other loops or forces from the files; then nothing is written.
     """
     result = open_result(folder, "export")
     if result.identification is None and not (folder / ESTIMATE).is_file():
@@ -442,7 +442,7 @@ def export_parallel(robot: ParallelMechanism, folder: Path, into: Path, prior: s
 
 
 def check_export_target(out: Path, inputs: Iterable[str | Path | None] = ()) -> None:
-    """Raise an error if an output folder has other content or contains an input file."""
+    """Raise UsageError if an output folder has other content or contains an input file."""
     check_target(out, tuple(USES), (PARAMETERS,), "export", inputs)
 
 
@@ -451,7 +451,7 @@ def _uses() -> Iterator[str]:
 
 
 def _check(opened: OpenedRobot, text: str, where: str, postures: int = 5) -> None:
-    """Refuse a file if Pinocchio reads loops that do not close, or other forces on the platform, on random motion."""
+    """Raise RobotError if Pinocchio computes open loops or other forces on the platform on random motion."""
     mechanism = opened.mechanism
     rng = np.random.default_rng(0)
     r = opened.mechanism.robot.r
@@ -494,9 +494,10 @@ def _check(opened: OpenedRobot, text: str, where: str, postures: int = 5) -> Non
 
 
 def _models(text: str) -> list[NativeModel]:
-    """Return Pinocchio's models of each leg and of a floating platform of an MJCF text: it reads one tree at a time.
+    """Return Pinocchio's models of each leg and of a floating platform of an MJCF text: Pinocchio reads one tree at a
+    time.
 
-    The keyframe is left out, since for joints without limits Pinocchio wants cosine and sine there.
+    The keyframe is left out, since Pinocchio requires cosine and sine for joints without limits.
     """
     root = ET.fromstring(text)
     world = root.find("worldbody")
@@ -513,7 +514,7 @@ def _models(text: str) -> list[NativeModel]:
 def _forces(
     opened: OpenedRobot, model: NativeModel, motion: LoopMotion, m: int, frames: dict[str, np.ndarray]
 ) -> np.ndarray:
-    """Return the forces (r,) of a Pinocchio model on the platform's coordinates in sample m; its frames are added."""
+    """Return the forces (r,) on the platform's coordinates in sample m by a Pinocchio model; adds to `frames`."""
     pin = import_module("pinocchio")
     data = model.createData()
     mechanism = opened.mechanism

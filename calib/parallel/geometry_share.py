@@ -45,9 +45,9 @@ def propagate(
     """Return the covariance of identified parameters with the share of the geometry's covariance.
 
     Args:
-        identification: with parallel-robot model.
-        covariance: of the geometry that it was made on.
-        cases: its training data; torques: of the actuators (N, n) in a case [N m or N].
+        identification: identification with a parallel robot's model.
+        covariance: covariance of the geometry on which the identification is based.
+        cases: training data; torques: returns the actuators' torques (N, n) of a case [N m or N].
 
     Raises:
         RobotError: for a covariance of another robot.
@@ -81,10 +81,10 @@ class _Differences:
     """Derivatives of an identification's residuals by the K constants of the loops and the tilts of gravity.
 
     Attributes:
-        identification: with parallel-robot model.
-        pairs: models on a geometry moved along a direction by `STEP`, and back.
-        by_direction: (directions, K + 2) what each constant, and each tilt, is of the directions.
-        torques: of the actuators (N, n) in a case.
+        identification: identification with a parallel robot's model.
+        pairs: per direction, the models on geometries displaced by +`STEP` and -`STEP`.
+        by_direction: (directions, K + 2) components of each constant and each tilt along the directions.
+        torques: returns the actuators' torques (N, n) of a case.
     """
 
     identification: Identification[ParallelModel]
@@ -123,7 +123,7 @@ class _Differences:
         """Return ∂(W φ - y)/∂g (M, rows, K + 2) and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K + 2) of a case's samples `span`.
 
         Args:
-            weighed: (M, rows) R⁻¹ (y - W φ) of the rows that the samples make.
+            weighed: (M, rows) R⁻¹ (y - W φ) of the rows that result from the samples.
         """
         columns = self.identification.base.kept
         values = self.identification.fitted.estimate.values

@@ -1,10 +1,10 @@
-"""Test of identical legs: do the recordings contradict one set of inertial parameters for all?
+"""Test of identical legs: whether the recordings contradict a common set of inertial parameters for all legs.
 
 The model with one set is nested in that with a set for each leg, so that by Fisher's test
 
     F = [(RSS - RSS_1) / (b_1 - b)] / [RSS_1 / (N - b_1)],
 
-RSS_1 and b_1 of the model with more parameters; rows are weighed alike, N counts rows that the residuals take as one.
+RSS_1 and b_1 being those of the model with more parameters; rows have equal weights, N counts independent rows.
 """
 
 from collections.abc import Sequence
@@ -23,10 +23,11 @@ from calib.parallel.mechanism.parallel_model import ParallelModel
 def legs_differ(
     identification: Identification[ParallelModel], cases: Sequence[Case], level: float = 0.001
 ) -> list[Finding]:
-    """Return the finding that legs are not identical, with the parameters that differ most; none where they may be.
+    """Return the finding that legs are not identical, with the parameters that differ most; empty if they may be
+    identical.
 
     Args:
-        identification: with identical legs; cases: its training data.
+        identification: identification with identical legs; cases: its training data.
         level: probability of a finding on legs that are identical (our choice).
     """
     model = identification.dynamics.model

@@ -61,8 +61,8 @@ class ParallelDynamics(DynamicsModel):
     def torques(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """Return the torques of all rows (N, rows) for a motion q, v, a (N, n) of the actuated joints, without payload.
 
-        Torques of the actuators [N m or N]; of redundant ones the forces on the platform's coordinates they share; or
-        their power [W]: as the model was identified.
+        As the model was identified: torques of the actuators [N m or N], for redundant ones the forces on the
+        platform's coordinates, or their power [W].
         """
         dynamics: Any = self.found.dynamics
         q = np.asarray(q, dtype=float)
@@ -87,15 +87,15 @@ def identify_parallel(
     """Return the identified dynamics of a parallel robot from recordings of its actuated joints, with a verdict.
 
     Args:
-        recordings, validate: files with a cut if wanted, or recordings in memory.
+        recordings, validate: files (optionally with a cut in time), or recordings in memory.
         options: filters, payloads, drives, method; ``rows``: motor (on the platform's coordinates where actuators are
             redundant) or power; ``passive``: friction of the passive joints.
-        method, friction: in place of the options'.
+        method, friction: replace those of the options; None to use these.
         designed: motions of `calib excite`, the reference of recordings that have none, for options with a [loop].
 
     Raises:
-        UsageError: for options that only serial arms know.
-        MeasurementError: for recordings that cannot be right.
+        UsageError: for options that apply to serial arms only.
+        MeasurementError: for invalid recordings.
     """
     options = options or IdentifyOptions()
     mechanism = robot.mechanism
@@ -145,7 +145,7 @@ def identify_parallel(
 
 
 def model_of(mechanism: ClosedRobot, settings: IdentificationSettings) -> ParallelModel:
-    """Return the model of a robot that the settings ask for, with their torque rows."""
+    """Return the model of a robot with the bodies, terms and torque rows of the settings."""
     v0 = per_joint(settings.v0, 1, "v0")[0]
     return make_parallel_model(
         mechanism,
@@ -240,7 +240,7 @@ def _driven_joints(
 
 
 def refuse_options_of_arms(settings: IdentificationSettings, options: IdentifyOptions) -> None:
-    """Raise an error for settings and options that apply to serial arms only."""
+    """Raise UsageError for settings and options that apply to serial arms only."""
     read = {field.name for field in fields(settings)} - OF_ARMS
     refuse_unread(settings, IdentificationSettings(), read, options.source)
     if settings.friction not in ("auto", "standard"):
@@ -258,7 +258,7 @@ def _of_arms(method: Method) -> bool:
 
 
 def _encoders(mechanism: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding]:
-    """Yield findings on contradictory redundant encoders, and on columns of passive joints that are not used."""
+    """Yield findings on contradictory redundant encoders, and on columns of passive joints (not used)."""
     robot = mechanism.robot
     passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
     for case in cases:

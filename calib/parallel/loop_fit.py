@@ -67,15 +67,15 @@ class ParallelFit(ChartedResult, Judged):
     """Result of the geometric calibration of a parallel robot: estimate, calibrated robot, errors, verdict.
 
     Attributes:
-        nominal: the robot before.
-        files: that were read.
+        nominal: the robot before calibration.
+        files: files that were read.
         rows: (m, n) encoder readings that were fitted, or (m, n + r) with the platform's coordinates behind them.
         fit: the calibration.
-        errors: on the fitted rows, nominal and calibrated (2, m, k): platform coordinates; or what encoders
-            contradict each other by.
-        unseen: the same of unseen rows, by name.
-        unseen_rows: the unseen rows themselves, by name, but those of a cross-validation.
-        settings: what was asked for.
+        errors: on the fitted rows, nominal and calibrated (2, m, k): errors of the platform coordinates or, of readings
+            alone, contradictions between the encoders.
+        unseen: such errors on held-out rows, by name of the set of rows.
+        unseen_rows: held-out rows by name, except those of a cross-validation.
+        settings: settings of the fit.
     """
 
     kind = BY_NAME["fit"]
@@ -266,7 +266,7 @@ class ParallelFit(ChartedResult, Judged):
 
 
 def check_fit_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
-    """Raise an error if an output folder has other content or contains an input file."""
+    """Raise UsageError if an output folder has other content or contains an input file."""
     check_target(out, FIT, (METRICS, ROBOT), "fit", inputs)
 
 
@@ -282,13 +282,13 @@ def fit_parallel(
     """Return the geometric calibration of a parallel robot from measured files, with a verdict on unseen rows.
 
     Args:
-        settings: holdout, tolerance and seed; the others are for serial arms.
-        options: ``fix`` alone.
+        settings: holdout, tolerance and seed; other settings apply to serial arms only.
+        options: only ``fix`` is used.
 
     Raises:
-        UsageError: for options that only serial arms know.
-        MeasurementError: for columns that are missing, or rows that no posture reaches.
-        Unidentifiable: for readings alone of a robot without redundant encoders.
+        UsageError: for options that apply to serial arms only.
+        MeasurementError: for missing columns, or rows that no posture reaches.
+        Unidentifiable: if only readings are given for a robot without redundant encoders.
     """
     say = progress or (lambda message: None)
     settings = settings or FitSettings()
@@ -335,7 +335,7 @@ def read_rows(path: Path, robot: ParallelRobot) -> np.ndarray:
     """Return readings (m, n), or (m, n + r) with platform coordinates appended if the file has such columns.
 
     Raises:
-        MeasurementError: naming the column that is missing, and which there are; or one that is not known.
+        MeasurementError: for a missing or unknown column.
     """
     table = read_table(path)
     passive = [joint.name for leg in robot.legs for joint in leg.chain.joints if joint.name not in robot.joint_names]
@@ -357,7 +357,7 @@ def read_coordinates(table: Table, robot: ParallelRobot) -> np.ndarray:
     """Return the platform coordinates (m, r) [m, rad] from the columns of a table.
 
     Raises:
-        MeasurementError: naming the column that is missing.
+        MeasurementError: for a missing column.
     """
     columns = []
     for name in robot.freedom:
@@ -367,7 +367,7 @@ def read_coordinates(table: Table, robot: ParallelRobot) -> np.ndarray:
 
 
 def _held(mechanism: ClosedRobot, settings: FitSettings, options: FitOptions) -> tuple[str, ...]:
-    """Return the names of fixed constants; raise an error for options that apply to serial arms only."""
+    """Return the names of fixed constants; raise UsageError for options that apply to serial arms only."""
     refuse_unread(settings, FitSettings(), READ)
     refuse_unread(options, FitOptions(), ("source", "fix"), options.source)
     names = [parameter.name for parameter in loop_parameters(mechanism)]

@@ -1,4 +1,4 @@
-"""The report of a parallel robot's fit in the form of a serial arm's, so that certificate and figures are the same."""
+"""Report of a parallel robot's fit in the form of a serial arm's report, for the common certificate and figures."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from calib.procedure.report.fit_report import CorrelatedPair, FittedParameter, R
 
 
 class ReportedFit(Protocol):
-    """What a report says of `calib.parallel.loop_fit.ParallelFit`."""
+    """The part of `calib.parallel.loop_fit.ParallelFit` that a report reads."""
 
     @property
     def nominal(self) -> ParallelMechanism: ...
@@ -53,7 +53,8 @@ CORRELATED = 0.9
 def report_of(fit: ReportedFit) -> Report:
     """Return the report of a fit: errors by set of rows, verdict, constants of the loops with their sigmas.
 
-    Encoders that contradict each other measure neither position nor orientation: of readings alone it states no errors.
+    A fit of readings alone states no errors, since contradictions between encoders are neither position nor orientation
+    errors.
     """
     robot = fit.nominal.chain
     estimate = fit.estimate
@@ -90,7 +91,7 @@ def report_of(fit: ReportedFit) -> Report:
 
 
 def write(fit: ReportedFit, folder: Path, plots: bool) -> None:
-    """Write ``report.json``, figures (if `plots`) and its certificate into a fit's folder."""
+    """Write ``report.json``, figures (if `plots`) and the certificate into a fit's folder."""
     from calib.procedure.report.certificate import results
     from calib.procedure.report.charts import saved
     from calib.procedure.report.geometry_figures import captioned
@@ -129,7 +130,7 @@ def _metrics(fit: ReportedFit) -> FitMetrics:
 
 
 def _unseen(fit: ReportedFit) -> dict[str, np.ndarray]:
-    """Return the errors of both robots on rows that were not fitted, by the names that reports have for them."""
+    """Return the errors of both robots on rows that were not fitted, by the names of sets of rows in reports."""
     renamed = {LEFT_OUT: fit_report.CROSS_VALIDATED}
     return {renamed.get(name, name): errors for name, errors in fit.unseen.items()}
 
@@ -142,7 +143,7 @@ def _compared(fit: ReportedFit, errors: np.ndarray, unseen: bool = True, paramet
 
 
 def _errors(fit: ReportedFit, joint_errors: np.ndarray) -> Errors:
-    """Return the sizes of errors (m, k) by kind; none where no coordinate of the platform was measured."""
+    """Return the magnitudes of errors (m, k) by kind; without any kind if no platform coordinate was measured."""
     if not fit.measured:
         return Errors(None, None, None)
     places = fit.nominal.chain.selected < 3
@@ -161,7 +162,7 @@ def _row_errors(fit: ReportedFit, name: str, errors: np.ndarray) -> RowErrors:
 
 
 def _sizes(fit: ReportedFit, errors: np.ndarray) -> dict[str, tuple[float, ...]]:
-    """Return the sizes of errors (m, k) of one robot by kind, of those that were measured."""
+    """Return the magnitudes of one robot's errors (m, k) by measured kind (position, orientation)."""
     sizes = _errors(fit, errors)
     by_kind = {}
     if sizes.position is not None:

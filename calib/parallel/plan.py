@@ -45,8 +45,8 @@ class _PlatformDynamics:
     """Dynamics along a path of the actuated joints: actuator torques for time-optimal planning.
 
     Attributes:
-        model: of the robot; values (p,) of its parameters.
-        carried: payloads on board.
+        model: model of the robot; values: (p,) of its parameters.
+        carried: payloads carried.
     """
 
     model: ParallelModel
@@ -87,8 +87,8 @@ class ParallelPlan(MotionPlan):
     """A planned motion of a parallel robot; the fields of the plan refer to the actuators.
 
     Attributes:
-        robot: with its file.
-        coordinates: (N, r) of the platform along it [m, rad].
+        robot: the robot, with its file.
+        coordinates: (N, r) platform coordinates along the motion [m, rad].
     """
 
     robot: ParallelMechanism
@@ -126,12 +126,13 @@ def plan_parallel(
     """Return the fastest motion of a parallel robot through the waypoints of a file.
 
     Args:
-        settings: payloads, lines and rate; the others are for serial arms.
+        settings: payloads, lines and rate; other settings apply to serial arms only.
         model: folder of an identification of the same robot; None: the file's inertias, without friction.
 
     Raises:
-        UsageError: for options that only serial arms know, waypoints out of the platform's box, no limits to keep.
-        NoPosture: for a path that leaves the workspace, naming the place.
+        UsageError: for options that apply to serial arms only, waypoints outside the platform's box, or actuators
+            without limits.
+        NoPosture: for a path that leaves the workspace; the message names the position.
     """
     say = progress or (lambda message: None)
     mechanism = robot.mechanism
@@ -167,7 +168,7 @@ def _read_waypoints(path: Path | np.ndarray, mechanism: ClosedRobot) -> np.ndarr
     """Return the platform coordinates (m, r) of waypoints: an array of them, or a CSV (see the module).
 
     Raises:
-        MeasurementError: for columns that are missing, and readings that no posture has.
+        MeasurementError: for missing columns, or readings at which the loops do not close.
     """
     if not isinstance(path, Path):
         return shaped(path, (None, len(mechanism.robot.freedom)), "waypoints")
@@ -218,7 +219,7 @@ def _paths(mechanism: ClosedRobot, points: np.ndarray, lines: bool, lever: float
 def _of_actuators(mechanism: ClosedRobot, path: JointPath, places_per_span: int = 100) -> JointPath:
     """Return the path of the actuated joints that corresponds to a path in platform coordinates.
 
-    `places_per_span`: places per span of the path at which the actuators are solved for.
+    `places_per_span`: number of points per span at which the actuators are solved for.
     """
     spans = len(path.knots) - 1
     s = np.interp(np.linspace(0.0, spans, places_per_span * spans + 1), np.arange(spans + 1), path.knots)

@@ -41,8 +41,8 @@ class ParallelMechanism:
 
     Attributes:
         mechanism: the robot, prepared for closing its loops.
-        source: its file.
-        covariance: of its loops' constants, as a fit states it; None: the geometry is taken as exact.
+        source: the file that describes the robot.
+        covariance: covariance of the loops' constants from a fit; None if the geometry is taken as exact.
     """
 
     mechanism: ClosedRobot
@@ -104,7 +104,7 @@ def find(robot: object) -> ParallelMechanism | None:
     """Return the parallel robot of a TOML file, a folder with one, or a library name; None for any other robot.
 
     Raises:
-        RobotError: for a file that contradicts itself, loops that do not close at home.
+        RobotError: for an inconsistent file, or loops that do not close at home.
     """
     if not isinstance(robot, (str, Path)):
         return None
@@ -135,7 +135,7 @@ def refuse_unread(settings: DataclassInstance, plain: object, read: Collection[s
         where: the file that contains them.
 
     Raises:
-        UsageError: naming the first.
+        UsageError: naming the first such setting.
     """
     for field in fields(settings):
         value = getattr(settings, field.name)

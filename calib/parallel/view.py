@@ -1,4 +1,4 @@
-"""What `calib view` draws of a parallel robot: closed loops and platform as lines, measured poses, torque rows."""
+"""Scene of a parallel robot for `calib view`: closed loops and platform as lines, measured poses, torque rows."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,7 +22,7 @@ DIMENSIONS.update(dict.fromkeys(COORDINATES[3:], "angle"))
 
 @dataclass(frozen=True, eq=False)
 class MechanismPicture:
-    """A parallel robot to draw, a `calib.results.scene.Drawn`; q (m, n) are readings of its actuated joints."""
+    """A parallel robot to be drawn, as `calib.results.scene.Drawn`; q (m, n) are readings of its actuated joints."""
 
     mechanism: ClosedRobot
 
@@ -70,11 +70,11 @@ class MechanismPicture:
         return rows.titles(self.joint_names), units
 
     def measured(self, path: Path) -> tuple[np.ndarray, ...]:
-        """Return what a fit's folder holds of its poses, in the order of `calib.results.scene.Measured`.
+        """Return the poses stored in a fit's folder, in the order of `calib.results.scene.Measured`.
 
         Readings q (m, n); positions (m, 3) of the platform seen, by the nominal and by the calibrated robot [m];
-        whether each was unseen (m,); rotation vectors from the calibrated to the measured orientation (m, 3) [rad], NaN
-        where no angle was measured. Without measured coordinates all positions are the calibrated robot's.
+        mask (m,) of the held-out poses; rotation vectors from the calibrated to the measured orientation (m, 3) [rad],
+        NaN where no angle was measured. Without measured coordinates all positions are the calibrated robot's.
         """
         robot = self.mechanism.robot
         table = read_table(FitFolder(path).residuals)
@@ -103,5 +103,5 @@ class MechanismPicture:
 
 
 def picture(robot: ParallelMechanism) -> MechanismPicture:
-    """Return what is drawn of a robot."""
+    """Return the drawable form of a parallel robot."""
     return MechanismPicture(robot.mechanism)

@@ -1,9 +1,9 @@
-"""Links of a URDF that are not in the arm's chain, as capsules: a second arm, a torso, a gripper, a camera.
+"""Links of a URDF outside the arm's chain, as capsules for collision tests: a second arm, a torso, a gripper, a camera.
 
-Their joints stand still, at zero or where it is stated, so that each link is fixed to one body of the arm or to its
-base. A capsule runs from each link's frame to that of each link behind it; a link that nothing follows is a sphere.
-Links without masses, pictures and shapes are mere frames and take no space, unless a joint outside the chain moves
-them.
+Joints outside the chain are fixed at zero or at a stated value, so that each such link is fixed to one body of the arm
+or to its base. A capsule runs from each link's frame to the frame of each of its child links; a link without children
+is a sphere. Links without mass, visual and collision shape are mere frames and take no space, unless a joint outside
+the chain moves them.
 """
 
 from collections.abc import Collection, Mapping
@@ -25,16 +25,16 @@ MIN_LENGTH = 1e-6
 def links_beside(
     source: str, where: str, chain: Chain, posture: Mapping[str, float] | None = None
 ) -> tuple[Attached, ...]:
-    """Return the links of a URDF text beside a chain of it, as capsules.
+    """Return the links of a URDF text that are outside a chain, as capsules.
 
     Args:
         source: the URDF.
-        where: names it in messages.
-        chain: whose base and tip are links of it.
-        posture: values of joints outside the chain [rad or m] that do not stand at zero.
+        where: name of the URDF in messages.
+        chain: the arm; its base and tip are links of the URDF.
+        posture: values of joints outside the chain [rad or m] that are not at zero.
 
     Raises:
-        RobotError: where its base or tip is no link of the URDF.
+        RobotError: if the chain's base or tip is no link of the URDF.
     """
     tree = read(source, where)
     path = tree.path(tree.link(chain.base, "base"), tree.link(chain.tip, "tip"))
@@ -80,7 +80,7 @@ def _with_space(tree: UrdfTree, source: str, where: str, chain_links: set[str]) 
 
 
 def _is_beside(tree: UrdfTree, chain_links: set[str], joint: JointTag) -> bool:
-    """Return whether a joint does not stand between the root and the chain."""
+    """Return whether a joint is not on the path from the root to the chain's tip."""
     before_chain: set[str] = set()
     for link in chain_links:
         before_chain.update(earlier.child for earlier in tree.ancestry(link))
@@ -88,13 +88,13 @@ def _is_beside(tree: UrdfTree, chain_links: set[str], joint: JointTag) -> bool:
 
 
 def _carrier(tree: UrdfTree, link: str, bodies: dict[str, int]) -> str:
-    """Return the last of the chain's moving links before a link; "" for what stands with the base."""
+    """Return the last of the chain's moving links before a link; "" for a link fixed to the base."""
     carriers = [joint.child for joint in tree.ancestry(link) if joint.child in bodies]
     return carriers[-1] if carriers else ""
 
 
 def _position(tree: UrdfTree, base: str, link: str, carrier: str, posture: Mapping[str, float]) -> np.ndarray:
-    """Return the origin (3,) of a link in the frame of the chain's moving element that carries it, else in the base.
+    """Return the origin (3,) [m] of a link in the frame of the moving element that carries it, or in the base.
 
     The element's frame is turned where its axis is oblique (`calib.robot.formats.urdf`).
     """
@@ -119,7 +119,7 @@ def _still_pose(tree: UrdfTree, link: str, posture: Mapping[str, float]) -> np.n
 
 
 def links_of(chain: Chain, source: Path | None) -> Collection[str]:
-    """Return the names of a robot's links: of all in its URDF, else of the arm's capsules."""
+    """Return the names of a robot's links: all links of its URDF, or the arm's capsules if there is no URDF."""
     if source is not None and is_urdf(source):
         return read(text(source)[0], str(source)).bodies
     return (chain.base, *(chain.links or [f"{name}_link" for name in chain.joint_names]), chain.tip)

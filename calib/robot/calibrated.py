@@ -77,7 +77,7 @@ class Deflection:
 
     Attributes:
         terms: the E effects.
-        coefficients: (E,) [unit of the element per unit of the basis].
+        coefficients: (E,) coefficients [unit of the element per unit of the basis].
         reference: the chain on which levers (and gravity torques) are evaluated: the nominal one, so that a basis does
             not change while the geometry is fitted.
     """
@@ -112,10 +112,10 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
         deflection: the terms, with their reference chain.
         q: (m, n).
         torque: (m, n) gravity torques [N m], for terms of basis ``torque``;
-            None: those of the reference chain (its masses).
+            None: those computed from the reference chain's masses.
 
     Raises:
-        CalibError: where a term needs gravity torques, and the reference chain has no masses.
+        CalibError: if a term needs gravity torques and the reference chain has no masses.
     """
     if torque is None and any(term.basis == "torque" for term in deflection.terms):
         torque = _reference_torques(deflection, q)
@@ -187,7 +187,7 @@ def target_elements(chain: Chain, deflection: Deflection) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class CorrectedChain:
-    """Geometry fitted together with joint corrections; to be used with them only.
+    """Geometry fitted together with joint corrections; valid only with these corrections.
 
     Attributes:
         chain: the geometry.
@@ -270,15 +270,15 @@ class CalibratedChain:
     def forward(self, q: ArrayLike, torque: np.ndarray | None = None) -> np.ndarray:
         """Return the tip's poses (m, 4, 4) [m] in the base frame at joint values q (m, n) [rad or m].
 
-        With joint corrections, the geometry fitted with them is used and they are applied.
+        If the robot has joint corrections, they are applied to the geometry that was fitted with them.
 
         Args:
-            q: joint values, those of one pose (n,) as well.
+            q: joint values (m, n), or (n,) for one pose.
             torque: (m, n) gravity torques [N m] for corrections by compliance; None: those of the masses that the fit
                 used.
 
         Raises:
-            CalibError: for a shape that does not fit, and for compliances of a robot without masses.
+            CalibError: for arrays of a wrong shape, and for corrections by compliance without torques or masses.
         """
         values = shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, self.chain.n), "q")
         bases = evaluate(self.deflection, values, torque) if self.deflection.terms else None
@@ -288,7 +288,7 @@ class CalibratedChain:
         """Return the tip's Jacobian (m, 6, n) [v; ω] in the base frame at joint values q (m, n), without corrections.
 
         Raises:
-            CalibError: for a shape that does not fit.
+            CalibError: for joint values of a wrong shape.
         """
         values = shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, self.chain.n), "q")
         return tip_jacobian(self.complete, values)
@@ -307,7 +307,7 @@ def read(path: str | Path) -> CalibratedChain:
     """Return the calibrated robot of a fit's (or an identification's) folder, or of any ``robot.toml``.
 
     Raises:
-        RobotError: naming the file and what in it is wrong.
+        RobotError: for an invalid file; the message names the file and the fault.
     """
     return read_whole(path)[0]
 
@@ -352,11 +352,11 @@ def write(
     """Write a calibrated robot to ``robot.toml`` and ``chain_covariance.csv``; `read` returns the same robot.
 
     Args:
-        folder: that exists.
+        folder: an existing folder.
         robot: the calibrated robot.
-        tables: more tables of ``robot.toml`` (`calib.robot.description.EXTRA`).
-        record: more entries of its provenance.
-        comment: where the numbers come from.
+        tables: further tables of ``robot.toml`` (`calib.robot.description.EXTRA`).
+        record: further entries of the table ``[provenance]``.
+        comment: source of the numbers, written as a comment.
     """
     nominal = None if robot.nominal is None else robot.nominal.values
     rigid = None if robot.corrections is None else robot.chain.values
@@ -377,7 +377,7 @@ def nominal_of(robot: CalibratedChain) -> Chain:
     """Return the nominal chain of a calibrated robot.
 
     Raises:
-        RobotError: if it is unknown.
+        RobotError: if the nominal chain is unknown.
     """
     if robot.nominal is None:
         raise RobotError(f"the nominal robot of '{robot.chain.name}' is unknown; fit again")
@@ -385,7 +385,9 @@ def nominal_of(robot: CalibratedChain) -> Chain:
 
 
 def _covariance(path: Path, names: tuple[str, ...]) -> np.ndarray | None:
-    """Return the covariance (k, k) of named values, zero for those not in a file's table; None without that file."""
+    """Return the covariance (k, k) of named values, zero for names that are not in the file's table; None without the
+    file.
+    """
     if not path.is_file():
         return None
     file_names, values = read_covariance(path)

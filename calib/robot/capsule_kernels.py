@@ -1,13 +1,12 @@
-"""Collision test of an arm of capsules, compiled (numba): posture by posture, ended by the first pair in collision.
+"""Collision test of an arm of capsules, compiled (numba): each posture ends at the first pair in collision.
 
 Path search tests a few postures at a time, thousands of times: NumPy's calls would cost more than the numbers.
 
     form      (K, 5): axis (0 to 5 as `calib.robot.chain.AXES`), sign, value, ratio, joint (-1: it does not move)
     fixed     (K + 1, 12): rotation by rows and origin before each element; row K the tail
-    attached  (E, 7): links outside the chain: number of moving elements before them; start and end in the last's frame
-    targets   (T, 3) in the tip's frame [m]
-    pairs     (P, 2) capsules compared with each other, radii (C,) [m]
-    faces     (W, 5): capsule, normal, offset of a wall
+    attached  (E, 7): links outside the chain: number of moving elements before the link; start and end in the frame of
+    the last of these targets   (T, 3) in the tip's frame [m] pairs     (P, 2) capsules compared with each other, radii
+    (C,) [m] faces     (W, 5): capsule, normal, offset of a wall
 """
 
 from math import cos, sin, sqrt
@@ -23,7 +22,7 @@ def clear(q, form, fixed, stand, attached, targets, pairs, radii, faces, margin)
     """Return the mask (m,) of joint values q (m, n) with all distances of `pairs` and `faces` above `margin` [m].
 
     Args:
-        stand: height of the foot of the base's capsule [m].
+        stand: height [m] of the lower end of the base's capsule. Other arguments: see the module.
     """
     count, moving = len(form), 0
     for k in range(count):

@@ -1,9 +1,9 @@
 """Distances between an arm of capsules, the floor and obstacles, in batches of poses without a loop.
 
 Each body is a capsule along the line from its joint's frame to the next one, the last one's to the tip, and each target
-that it carries a thin one from the tip to the target: coarse where links bend away from these lines. Distances between
-capsules are those of their lines (Ericson 2005, Real-Time Collision Detection, 5.1.9) less the radii.
-Obstacles and their signed distances are in `calib.robot.obstacles`.
+is a thin capsule from the tip to the target: coarse where links bend away from these lines. Distances between capsules
+are the distances of their centre lines (Ericson 2005, Real-Time Collision Detection, 5.1.9) less the radii. Obstacles
+and their signed distances are in `calib.robot.obstacles`.
 """
 
 from __future__ import annotations
@@ -45,8 +45,9 @@ class Attached:
     """Link outside the chain: a capsule fixed to a body of the arm, or to its base; a sphere where it has no length.
 
     Attributes:
-        body: number of moving elements before it; 0 is the base.
-        start, end: (3,) in the frame of the last of these, or in the base frame [m].
+        body: number of moving elements before the link; 0 for a link fixed to the base.
+        start, end: (3,) ends of the capsule's line [m], in the frame of the last of these elements or in the base
+            frame.
     """
 
     name: str
@@ -60,21 +61,21 @@ def inseparable(
 ) -> tuple[np.ndarray, tuple[tuple[str, str], ...]]:
     """Return the mask (pairs,) of pairs that touch in nearly every posture, and their names.
 
-    Parts of an arm: those nearer than `margin` in at least 95 % of the postures (MoveIt's setup assistant: that touch),
-    or never further apart than margin + slack: neighbours, whose shapes overlap by construction. Against what stands
-    fixed in the world: only pairs that are nearer, at a distance that no joint changes; an obstacle that the arm nearly
-    always hits is an obstacle. A link at a distance that no joint changes, the turret of an arm, may touch what it
-    stands on: by as much as shapes this coarse cannot tell.
+    Two parts of the arm count if they are nearer than `margin` in at least 95 % of the postures (as in MoveIt's setup
+    assistant), or never further apart than margin + slack: neighbours, whose shapes overlap by construction. A part of
+    the arm and an object fixed in the world count only if no joint changes their distance: an obstacle that the arm
+    nearly always hits remains an obstacle. Such a fixed link, the turret of an arm, may overlap what it stands on by
+    the resolution of the shapes.
 
     Args:
-        pairs: names of link and thing.
+        pairs: names of link and link, or of link and object.
         distances: (N, pairs) [m] in N random postures, signed.
-        fixed: (pairs,) whether the pair is one with the world.
-        margin: the least distance that will be asked for [m].
-        slack: distance that shapes as coarse as these cannot resolve [m].
+        fixed: (pairs,) whether the second of the pair is fixed in the world.
+        margin: the least distance that will be required [m].
+        slack: distance that shapes as coarse as capsules cannot resolve [m].
 
     Raises:
-        RobotError: for a floor or obstacle in permanent collision with a link (wrong size or place).
+        RobotError: for a floor or obstacle in permanent collision with a link (wrong size or position).
     """
     nearly_always = (distances <= margin).mean(axis=0) >= ALWAYS
     highest = distances.max(axis=0)
@@ -98,7 +99,7 @@ def inseparable(
 def usual_radius(chain: Chain) -> float:
     """Return the default radius [m] of the capsules that represent an arm's links.
 
-    A base below the first joint counts as no longer than the longest link: an arm on a pillar is no thicker for it.
+    A base below the first joint counts at most as long as the longest link, so that a pillar does not thicken the arm.
     """
     lines = _lines_of(chain, np.zeros((1, chain.n)), np.empty((0, 3)))
     lengths = np.linalg.norm(lines.end - lines.start, axis=2)[0]
@@ -113,8 +114,8 @@ class _Lines:
     """Centre lines of the capsules in m postures.
 
     Attributes:
-        start, end: (m, C, 3) [m].
-        axes, origins: (m, K, 3) of the K moving elements: direction, and where they stand.
+        start, end: (m, C, 3) ends of the lines of C capsules [m].
+        axes, origins: (m, K, 3) direction and origin [m] of the axis of each of K moving elements.
     """
 
     start: np.ndarray
@@ -123,7 +124,7 @@ class _Lines:
     origins: np.ndarray
 
     def of_postures(self, chosen: np.ndarray) -> _Lines:
-        """Return the lines in some of the postures: a mask (m,) or their numbers."""
+        """Return the lines in the postures `chosen`, a mask (m,) or indices."""
         return _Lines(self.start[chosen], self.end[chosen], self.axes[chosen], self.origins[chosen])
 
 
@@ -133,16 +134,16 @@ class Capsules:
 
     Attributes:
         chain: the arm.
-        names: (C,) of the capsules.
-        bodies: (C,) number of moving elements before each; 0 is the fixed base.
-        radii: (C,) [m].
-        solid: (S,) capsules with a length; the others are ignored.
-        targets: (T, 3) in the tip's frame [m]; their capsules are the last T.
+        names: (C,) names of the capsules.
+        bodies: (C,) number of moving elements before each capsule; 0 for the fixed base.
+        radii: (C,) radii of the capsules [m].
+        solid: (S,) indices of the capsules with a length; others are ignored.
+        targets: (T, 3) positions of the targets in the tip's frame [m]; their capsules are the last T.
         beside: links outside the chain; their capsules come before those of the targets.
         arm_pairs: (P, 2) pairs of capsules to compare.
         world_pairs: (W, 2) pairs of capsule and wall or obstacle (walls first) to compare.
-        walls: the floor among them.
-        obstacles: in the base frame.
+        walls: planes that the arm must not cross, including the floor.
+        obstacles: obstacles in the base frame.
         excluded: pairs that are not compared, since they touch in nearly every posture.
     """
 
@@ -231,17 +232,17 @@ class Capsules:
 
     @cached_property
     def _with_obstacles(self) -> Capsules | None:
-        """The same model with the pairs of arm and obstacles only; None without obstacles."""
+        """This model reduced to the pairs of arm and obstacles; None without obstacles."""
         obstacle_pairs = self.world_pairs[self.world_pairs[:, 1] >= len(self.walls)]
         if not len(obstacle_pairs):
             return None
         return replace(self, arm_pairs=self.arm_pairs[:0], world_pairs=obstacle_pairs)
 
     def beam(self, q: np.ndarray, start: np.ndarray, slope: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the links' distances from lines of sight to a target on the last body, with their derivatives.
+        """Return the links' distances from the lines of sight to a target on the last body, and the derivatives.
 
         Args:
-            q: (m, n).
+            q: (m, n) joint values [rad or m].
             start: (m, 3) position of the target [m], and slope: (m, 3, n) its derivative by the joint values.
             end: (3,) or (m, 3), position of the instrument in the base frame [m].
 
@@ -271,8 +272,8 @@ class Capsules:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Return distances (m, P + W), normals (m, P + W, 3) towards the second body, and the nearest points.
 
-        For the W pairs with the world the second body is the arm's. `rough` takes from obstacles what they are at least
-        away, by the middles of the lines.
+        In the W pairs with walls or obstacles the second body is the arm's. `rough`: use a lower bound of the distance
+        to obstacles, from the midpoints of the lines.
         """
         m = len(lines.start)
         count = len(self.arm_pairs) + len(self.world_pairs)
@@ -321,8 +322,8 @@ def closing_speed(
     """Return the speed along the normals (m, P, n) of points (m, P, 3) on bodies (P,), per unit of each joint.
 
     Args:
-        axes, origins: (m, K, 3) of the K moving elements: direction, and where they stand.
-        bodies: how many moving elements stand before each point.
+        axes, origins: (m, K, 3) direction and origin [m] of the axis of each of K moving elements.
+        bodies: (P,) number of moving elements before each point.
     """
     z = axes.transpose(0, 2, 1)
     moment = np.cross(axes, origins).transpose(0, 2, 1)
@@ -351,20 +352,20 @@ def from_chain(
 ) -> Capsules:
     """Return the collision model of an arm with capsules from each joint frame to the next.
 
-    Bodies whose frame and the next one coincide (in a spherical wrist) have no capsule.
+    A body whose frame coincides with the next one (in a spherical wrist) has no capsule.
 
     Args:
         chain: the arm.
-        radius: of the capsules [m]; None: `usual_radius`.
+        radius: radius of the capsules [m]; None: `usual_radius`.
         floor: height of a floor in the base frame [m]; None for no floor.
-        obstacles: in the base frame.
-        walls: that it does not pass.
-        targets: (T, 3) of what is measured, in the tip's frame [m].
-        margin: the least distance that will be asked for [m]; pairs that never have it are left out.
-        within: False: parts of the arm are not compared with each other.
+        obstacles: obstacles in the base frame.
+        walls: planes that the arm must not cross.
+        targets: (T, 3) positions of the measured targets in the tip's frame [m].
+        margin: the least distance that will be required [m]; pairs that are always nearer are excluded.
+        within: whether parts of the arm are compared with each other.
         ignored: pairs of links that are not compared.
-        beside: links outside the chain, compared with all that moves relative to them.
-        seed: of the random postures that show which pairs those are.
+        beside: links outside the chain, compared with every link that moves relative to them.
+        seed: seed of the random postures that determine the excluded pairs.
     """
     link_radius = usual_radius(chain) if radius is None else radius
     target_positions = np.asarray(targets, dtype=float).reshape(-1, 3)

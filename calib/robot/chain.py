@@ -33,7 +33,7 @@ def check_gravity(gravity: np.ndarray, where: str = "") -> None:
     """Refuse an implausible gravity vector (3,) [m/s²]; the message begins with `where`.
 
     Raises:
-        RobotError: for one beyond `MAX_GRAVITY`, or not finite.
+        RobotError: for a vector longer than `MAX_GRAVITY`, or not finite.
     """
     if not math.hypot(*gravity) < MAX_GRAVITY:
         raise RobotError(f"{where}gravity {gravity.tolist()} is not plausible: expected about 9.81 m/s²")
@@ -43,7 +43,7 @@ def check_gravity(gravity: np.ndarray, where: str = "") -> None:
 class Joint:
     """One actuated joint: its name, kind and limits (SI; infinite where none are given).
 
-    `unstated` names limits below `MIN_LIMIT` as they were written (``velocity 0``): taken as not stated, with a remark.
+    `unstated` lists limits below `MIN_LIMIT` as written (``velocity 0``); they count as not stated, with a remark.
     """
 
     name: str
@@ -82,14 +82,14 @@ class Element:
     """One elementary transform ``placement · exp(sign · axis · (value + ratio · q))``.
 
     Attributes:
-        name: as it appears in tables, e.g. ``alpha3`` or ``elbow_joint.x``.
+        name: name in tables, e.g. ``alpha3`` or ``elbow_joint.x``.
         axis: one of `AXES`.
-        value: [m] or [rad].
+        value: constant part of the displacement [m or rad].
         owner: index of the joint whose placement it helps to describe; n for what follows the last joint.
-        joint: index of the joint that moves it, None where it is constant.
+        joint: index of the joint that moves the element, None for a constant element.
         ratio: 1, or the multiplier of a mimic joint.
         sign: +1 or -1, for a joint axis that points against the elementary one.
-        placement: (4, 4), the fixed transform before it; None for the identity.
+        placement: (4, 4), fixed transform before the element; None for the identity.
     """
 
     name: str
@@ -127,7 +127,7 @@ class Chain:
         links: names of the n links after the joints (URDF), for messages and export.
         floor: height of the floor under the arm, in the base frame [m]; the default for collision tests.
         remarks: suspicious values in its description, found by the reader.
-        ends: how the tip was chosen, where a description left the choice (URDF), and joints that are not in the arm.
+        ends: remarks on how the tip was chosen, if the description left it open (URDF), and on joints outside the arm.
     """
 
     name: str
@@ -201,7 +201,7 @@ class Chain:
 
     @cached_property
     def moving(self) -> np.ndarray:
-        """(n,) indices of the first element moved by each joint (followers of mimic joints come later)."""
+        """Indices (n,) of the first element moved by each joint (followers of mimic joints come later)."""
         first: dict[int | None, int] = {}
         for k in self.driven.tolist():
             first.setdefault(self.elements[k].joint, k)
@@ -209,7 +209,7 @@ class Chain:
 
     @cached_property
     def rates(self) -> np.ndarray:
-        """Displacements of the elements `driven` per unit of each joint, (driven, n)."""
+        """Displacement of each `driven` element per unit of each joint, (driven, n)."""
         rates = np.zeros((len(self.driven), self.n))
         for row, k in zip(rates, self.driven):
             row[self.elements[k].joint] = self.elements[k].ratio
@@ -256,8 +256,8 @@ def random_joints(chain: Chain, count: int, seed: int | np.random.Generator = 0)
 def element_length(chain: Chain, k: int) -> float:
     """Return the constant displacement along translation k [m], including the part from its joint's placement.
 
-    A URDF's joint origin is a placement followed by zero-valued elements, so that its lengths stand in the placement.
-    Zero for rotations and for what a joint moves.
+    A URDF's joint origin is a placement followed by zero-valued elements, so that its lengths are in the placement.
+    Zero for rotations and for elements that a joint moves.
     """
     element = chain.elements[k]
     if element.axis[0] != "t" or element.joint is not None:

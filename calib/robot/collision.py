@@ -72,7 +72,8 @@ class Collision:
         """Return the derivatives (m, pairs, n) of `distances` with respect to q (m, n).
 
         With the normal u from the first shape's nearest point to the second's: d' = u · (velocity of the second point -
-        velocity of the first), the shapes' curvature being of second order. One-sided where nearest points jump.
+        velocity of the first), the effect of the shapes' curvature being of second order. Where nearest points jump,
+        the derivative is one-sided.
         """
         shape = (len(q), len(self.pairs), 3)
         normals = np.empty(shape)
@@ -95,7 +96,9 @@ class Collision:
         return second_speed - first_speed
 
     def beam(self, q: np.ndarray, start: np.ndarray, slope: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return the links' distances from lines of sight; see `calib.robot.capsules.Capsules.beam`."""
+        """Return the links' distances from the lines of sight to a target, and the derivatives; see
+        `calib.robot.capsules.Capsules.beam`.
+        """
         pin, coal = _libraries()
         data = self._model.createData()
         geometry_data = pin.GeometryData(self._geometry)
@@ -139,7 +142,7 @@ class Collision:
             yield geometry_data.distanceResults
 
     def _configurations(self, q: np.ndarray) -> np.ndarray:
-        """Return Pinocchio's configurations (m, nq) at joint values q (m, n), other joints at the posture."""
+        """Return Pinocchio's configurations (m, nq) at q (m, n), joints outside the chain at the model's posture."""
         result = configurations(self._model, self._chain, q)
         set_still(self._model, result, self._posture)
         return result
@@ -191,24 +194,25 @@ def from_urdf(
     posture: Mapping[str, float] | None = None,
     seed: int = 0,
 ) -> Collision:
-    """Return the collision model of a URDF's collision shapes; joints outside the chain stand still.
+    """Return the collision model of a URDF's collision shapes; joints outside the chain are fixed.
 
     Args:
         path: the URDF.
         base, tip: see `calib.robot.formats.arm_ends`.
         floor: height of a floor in the base frame [m]; None for no floor.
-        obstacles: in the base frame.
-        mesh_folders: where ``package://name/...`` is looked for, besides the URDF's folder and the ones above it.
-        walls: that it does not pass.
-        targets: (T, 3) of what is measured, in the tip's frame [m]: each a thin capsule from the tip.
-        margin: the least distance that will be asked for [m]; pairs that never have it are left out.
-        within: False: parts of the arm are not compared with each other.
+        obstacles: obstacles in the base frame.
+        mesh_folders: folders in which ``package://name/...`` is searched, besides the URDF's folder and its parents.
+        walls: planes that the arm must not cross.
+        targets: (T, 3) positions of the measured targets in the tip's frame [m]: each becomes a thin capsule from the
+            tip.
+        margin: the least distance that will be required [m]; pairs that are always nearer are excluded.
+        within: whether parts of the arm are compared with each other.
         ignored: pairs of links that are not compared.
-        posture: values of joints outside the chain [rad or m] that do not stand at zero.
-        seed: of the random postures that show which pairs those are.
+        posture: values of joints outside the chain [rad or m] that are not at zero.
+        seed: seed of the random postures that determine the excluded pairs.
 
     Raises:
-        RobotError: where the URDF has no usable collision shape.
+        RobotError: if the URDF has no usable collision shape.
     """
     pin, _ = _libraries()
     source = text(path)[0]
@@ -316,7 +320,7 @@ def _solid(kind: str, sizes: Sequence[float]) -> NativeShape:
 
 
 def set_still(model: NativeModel, configurations: np.ndarray, posture: Mapping[str, float]) -> None:
-    """Write the values of the joints of a posture [rad or m] into Pinocchio's configurations (m, nq)."""
+    """Write the values of joints outside the chain [rad or m], by name, into Pinocchio's configurations (m, nq)."""
     for name, value in posture.items():
         joint = model.joints[model.getJointId(name)]
         values = [value] if joint.nq == 1 else [np.cos(value), np.sin(value)]
@@ -324,7 +328,7 @@ def set_still(model: NativeModel, configurations: np.ndarray, posture: Mapping[s
 
 
 def _link_pose(model: NativeModel, link: str, posture: Mapping[str, float]) -> NativeShape:
-    """Return the pose of a link in Pinocchio's world, at zero joints but those of a posture."""
+    """Return the pose of a link in Pinocchio's world, with all joints at zero except those of `posture`."""
     pin, _ = _libraries()
     data = model.createData()
     configuration = pin.neutral(model)[None]
@@ -385,7 +389,7 @@ def find_mesh(name: str, folders: Sequence[Path]) -> Path | None:
 
 
 def package_folders() -> list[Path]:
-    """Return the folders that hold ROS packages: of ``ROS_PACKAGE_PATH``, and of the installed ROS."""
+    """Return the folders that hold ROS packages: those of ``ROS_PACKAGE_PATH``, and of the installed ROS."""
     sources = os.environ.get(PACKAGE_PATH, "").split(os.pathsep)
     prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     folders = [Path(source) for source in sources if source]
@@ -396,7 +400,7 @@ def package_folders() -> list[Path]:
 def meshes_beside(path: Path) -> dict[str, Path | str]:
     """Return the mesh files of a URDF's collision shapes, by their paths next to its copy in ``1-robot``.
 
-    Names from the root, or that lead out of their folder, are left out: a copy of the URDF finds them, or nothing does.
+    Absolute names, and names that lead out of the URDF's folder, are left out.
     """
     if not is_urdf(path):
         return {}

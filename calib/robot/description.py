@@ -157,7 +157,7 @@ def remarks(chain: Chain, bodies: bool = True) -> tuple[str, ...]:
 
 
 def impossible_bodies(chain: Chain) -> tuple[str, ...]:
-    """Return a sentence per group of physically impossible bodies, with their joints; () without masses.
+    """Return a sentence per group of physically impossible bodies, with their joints; () if there are none.
 
     A body has M > 0 and, about its centre of mass, positive principal moments of which none exceeds the sum of the
     others (triangle inequality; Wensing, Kim and Slotine, 2018, eq. 7). Its radius of gyration and its centre of mass
@@ -219,7 +219,7 @@ def read(path: str | Path, propose_beta: bool = True) -> Chain:
         propose_beta: see `calib.robot.mdh`; a file may switch it off itself.
 
     Raises:
-        RobotError: naming the table, the key and what is wrong with it.
+        RobotError: for an invalid file; the message names the table, the key and the fault.
     """
     return read_whole(path, propose_beta)[0]
 
@@ -253,8 +253,8 @@ def write(path: str | Path, chain: Chain, extra: Mapping[str, object] | None = N
     Args:
         path: the file.
         chain: any chain.
-        extra: tables by name, of `EXTRA`, kept as they are.
-        source: where the numbers come from.
+        extra: further tables by name (those of `EXTRA`), written unchanged.
+        source: source of the numbers, written as a comment.
     """
     tables.check_keys(extra or {}, EXTRA, f"robot '{chain.name}', extra tables")
     if mdh.is_table(chain) and not chain.links:

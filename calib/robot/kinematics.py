@@ -23,7 +23,7 @@ class Sweep:
         directions: (K, 3, m) unit vector of each element's motion, in the reference frame, sign included.
         origins: (K, 3, m) origin of each element's frame [m].
         rotation: (3, 3, m), ``rotation[c]`` being column c of the flange's rotation.
-        position: (3, m) of the flange [m].
+        position: (3, m) position of the flange [m].
     """
 
     directions: np.ndarray
@@ -43,7 +43,7 @@ def _walk(
 
     Args:
         start: rotation and position of the base (`_start`).
-        extra: as of `sweep`.
+        extra: as in `sweep`.
     """
     rotation, position = start
     for k, element in enumerate(chain.elements):
@@ -71,7 +71,7 @@ def sweep(chain: Chain, q: np.ndarray, base: np.ndarray | None = None, extra: np
         chain: the arm.
         q: (m, n) joint values [rad or m].
         base: (4, 4) or (m, 4, 4), the pose of the arm's base in the reference; None for the identity.
-        extra: (K, m) added to the elements' displacements (deflections) [m or rad].
+        extra: (K, m) displacements added to those of the elements (deflections) [m or rad]; None without.
     """
     q = shaped(q, (None, chain.n), f"joint values of '{chain.name}'")
     shape = (len(chain.elements), 3, len(q))
@@ -95,12 +95,12 @@ def element_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, index: np.n
     For a rotation about z through o: [z × (point - o); z]; for a translation along z: [z; 0].
 
     Args:
-        walked: what `sweep` returned.
+        walked: the result of `sweep`.
         point: (3, m) [m], in the reference frame.
-        index: which elements; None for all K.
+        index: indices of the elements; None for all K.
 
     Returns:
-        (K, 6, m), or as many as `index` names: linear velocity of the point, then angular velocity, both in the
+        (K, 6, m), or one row per entry of `index`: linear velocity of the point, then angular velocity, both in the
         reference frame.
     """
     angular = np.array([element.axis[0] == "r" for element in chain.elements])
@@ -144,13 +144,13 @@ def twist_product(
 
     Args:
         chain: the arm.
-        elements: (K, 6, m) what `element_jacobian` returns for all elements, at the point of the columns.
-        columns: (p, 6, m) the J_k.
-        places: (p,) the element each belongs to; -1 before the arm, K behind it.
+        elements: (K, 6, m) `element_jacobian` of all elements, at the point of the columns.
+        columns: (p, 6, m) the columns J_k.
+        places: (p,) index of each column's element; -1 before the arm, K behind it.
         G: (p, 6, m) weights.
 
     Returns:
-        (n, m).
+        (n, m) [unit of the columns per rad or m].
     """
     moving = chain.driven
     v, w = columns[:, :3], columns[:, 3:]
@@ -169,9 +169,10 @@ def joint_jacobian(chain: Chain, walked: Sweep, point: np.ndarray, before: int |
     """Return the Jacobian (m, 6, n) of `point` with respect to the joints, including mimic followers.
 
     Args:
-        walked: what `sweep` returned.
+        walked: the result of `sweep`.
         point: (3, m) [m], in the reference frame.
-        before: elements from this one on lie behind the point and do not move it; None: the flange carries it.
+        before: index of the first element behind the point, from which on elements do not move it; None for a point on
+            the flange.
 
     Returns:
         (m, 6, n): linear velocity of the point, then angular velocity, both in the reference frame.
@@ -218,14 +219,14 @@ def gravity_torques(chain: Chain, q: np.ndarray) -> np.ndarray:
     """Return the torques (m, n) [N m or N] that hold an arm of known masses still against gravity, g(q) = ∂U/∂q.
 
     With m_j and s_j the mass and the first moment of all bodies from joint j on, o_j its origin and z_j its axis:
-    -g · (z_j × (s_j - m_j o_j)) where it turns, -g · z_j m_j where it slides.
+    -g · (z_j × (s_j - m_j o_j)) for a revolute joint, -g · z_j m_j for a prismatic one.
 
     Args:
-        chain: with `inertias`; without mimic joints.
-        q: (m, n) [rad or m].
+        chain: the arm, with `inertias` and without mimic joints.
+        q: (m, n) joint values [rad or m].
 
     Raises:
-        RobotError: where the masses are unknown, or one joint moves several elements.
+        RobotError: if masses are unknown, or one joint moves several elements.
     """
     if len(chain.driven) != chain.n:
         refuse_robot(f"robot '{chain.name}'", "gravity torques of mimic joints are not implemented")

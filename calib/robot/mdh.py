@@ -290,7 +290,7 @@ def _regroup(chain: Chain, index: int, group: list[Element]) -> Row:
 
 
 def _entry(row: Row, expected: int) -> dict[str, object]:
-    """Return the [[joint]] table of a row, without default values (the four parameters are always written)."""
+    """Return the [[joint]] table for a row, without default values (the four parameters are always written)."""
     entry: dict[str, object] = {"name": row.name}
     if row.kind != "revolute":
         entry["kind"] = row.kind

@@ -1,7 +1,7 @@
 """Obstacles in an arm's base frame: boxes, spheres, cylinders and walls, with signed distances.
 
-Distances are signed: negative is the depth inside. Those of convex bodies are convex functions of the point, so that
-the nearest point of a line is found by golden sections, inside as outside.
+Distances are signed: negative is the depth inside. The distance from a convex body is a convex function of the point,
+so that golden-section search finds the nearest point of a line, inside the body as well as outside.
 """
 
 from __future__ import annotations

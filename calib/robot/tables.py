@@ -132,7 +132,7 @@ def word(table: Mapping[str, object], key: str, where: str, default: str | None 
     """Return a non-empty text from a table.
 
     Raises:
-        RobotError: where it is something else, or missing without a default.
+        RobotError: if the value is no text or empty, or missing without a default.
     """
     value = table.get(key, default)
     if value is None:

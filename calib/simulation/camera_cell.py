@@ -1,7 +1,7 @@
 """A virtual cell with a camera: true arm, true placements of camera and board, and simulated images.
 
-Corners are either projected, with white noise (`photograph`), or found in rendered images (`take_pictures`), which have
-everything that real images have: see `calib.simulation.rendered_camera`.
+Corners are either projected, with white noise (`photograph`), or detected in rendered images (`take_pictures`) with
+lens, blur, light and noise: see `calib.simulation.rendered_camera`.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ class CameraCell:
     """A cell with one camera and one board.
 
     Attributes:
-        cell: the arm, and where camera and board are; its truth has `Installation.optics`.
-        board: as its file says.
+        cell: the arm and the placements of camera and board; its truth has `Installation.optics`.
+        board: the board as described in its file.
         mounting: ``in hand`` or ``to hand``.
     """
 
@@ -110,10 +110,10 @@ def camera_cell(
     """Return a virtual cell whose instrument is a camera.
 
     Args:
-        cell: whose arm it is; its instrument is left out but for the noise of the encoders.
+        cell: the cell whose arm and encoder noise are used; its instrument is replaced by the camera.
         mounting: what the arm carries: the camera (``in hand``) or the board (``to hand``).
-        board, lens, shape: the board, the camera, and how the print differs.
-        reach_of_arm: how far the arm's workspace reaches [m]; None to find out.
+        board, lens, shape: the board, the camera's lens, and the deviation of the print; None for an exact print.
+        reach_of_arm: largest distance of the arm's workspace from its base [m]; None to compute it.
     """
     arm = cell.truth.chain
     reach = reach_of_arm or _reach(arm)
@@ -175,12 +175,12 @@ def views(
 
     Args:
         camera: the cell.
-        count: how many.
-        seed: of the draw.
-        sought: which views.
+        count: number of views.
+        seed: seed of the random draw.
+        sought: ranges of the views; None for the default ranges.
 
     Raises:
-        CannotSimulate: where hardly any are found.
+        CannotSimulate: if hardly any such joint values are found.
     """
     sought = sought or Views()
     min_distance, max_distance = sought.distance
@@ -278,10 +278,10 @@ def take_pictures(
     Args:
         camera: the cell.
         q: joint values [rad or m]; recorded with the encoders' noise.
-        folder: to write into.
+        folder: folder to write into.
         imaging: light, focus and noise.
-        seed: of all noise.
-        moving: (m, n) how far the joints move during the exposure [rad or m]; None: the arm stands still.
+        seed: seed of all noise.
+        moving: (m, n) motion of the joints during the exposure [rad or m]; None: the arm stands still.
         say: called with a line on each image.
     """
     from calib.data.images.images import write_image

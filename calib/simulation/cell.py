@@ -2,10 +2,10 @@
 
     y_i = S_true · arm_true(q_i + δ(q_i)) · X_true · noise,     q_recorded = q_i + encoder noise,
 
-δ being what no rigid geometry holds: compliance under gravity and gear harmonics, which a richer model can, and what
-none can (`unmodelled`). With LEDs on the base the instrument
-sees the base, too, and reports the tool in the base LEDs' frame: B_i⁻¹ y_i, so that both frames' noises count and the
-base's orientation noise acts with the lever between the two.
+δ being displacements beyond the rigid geometry: compliance under gravity and gear harmonics, which joint corrections
+can describe, and effects that no model describes (`unmodelled`). With LEDs on the base the instrument sees the base,
+too, and reports the tool in the base LEDs' frame: B_i⁻¹ y_i, so that both frames' noises count and the base's
+orientation noise acts with the lever between the two.
 
 Writing simulated measurements and logs as CSV files for `calib`.
 """
@@ -40,14 +40,15 @@ class SimulatedInstrument:
     """An instrument that measures frames (or points) with white noise.
 
     Attributes:
-        name: for messages and certificates.
-        position_sigma: per axis [m].
-        orientation_sigma: about each axis [rad]; None where it sees points only.
-        drift: how far the instrument wanders over one series [m], evenly with the row number.
+        name: name for messages and certificates.
+        position_sigma: σ of a measured position per axis [m].
+        orientation_sigma: σ of a measured orientation about each axis [rad]; None if the instrument measures points
+            only.
+        drift: displacement of the instrument over one series [m], linear in the row number.
         outlier_share: share of rows with a gross error.
         outlier_size: length of a gross error [m].
-        encoder_sigma: of the recorded joint values [rad or m].
-        base_frame: pose (4, 4) of the base LEDs in the arm's base; None where there are none.
+        encoder_sigma: σ of the recorded joint values [rad or m].
+        base_frame: pose (4, 4) of the base LEDs in the arm's base; None without base LEDs.
     """
 
     name: str = "optical CMM"
@@ -65,11 +66,11 @@ class Cell:
     """A cell with one station and one tool.
 
     Attributes:
-        nominal: what the engineer takes the arm to be.
-        truth: what it is, where it stands, what the tool is, and how its joints deflect; hidden from a calibration.
-        instrument: what measures.
-        note: what the truth is made of, in a sentence.
-        unmodelled: errors that no parameter of a calibration holds.
+        nominal: the nominal arm.
+        truth: the true arm with station, tool and deflections, hidden from a calibration.
+        instrument: the instrument.
+        note: a sentence on how the truth was generated.
+        unmodelled: position errors that no parameter of a calibration describes.
     """
 
     nominal: Chain
@@ -85,7 +86,7 @@ def true_poses(cell: Cell, q: np.ndarray, warm: float = np.inf) -> np.ndarray:
     Args:
         cell: the cell.
         q: (m, n) joint values in the order in which the arm takes them [rad or m].
-        warm: how many poses the arm has moved to before; infinite for a warm arm.
+        warm: number of poses to which the arm has moved before; infinite for a warm arm.
     """
     arm = cell.truth.chain
     q = shaped(q, (None, arm.n), "joint values")
@@ -105,10 +106,10 @@ def measure(
 
     Args:
         cell: the cell.
-        q: where the robot is sent; the encoders' reading of it is what is recorded.
-        seed: of the noise.
-        file: the name the measurement carries.
-        warm: how many poses the arm has moved to before; infinite for a warm arm.
+        q: true joint values (m, n); the recorded ones have encoder noise added.
+        seed: seed of the noise.
+        file: file name stored in the measurement.
+        warm: number of poses to which the arm has moved before; infinite for a warm arm.
 
     Returns:
         Poses (or positions), with the sigmas that the instrument's maker states, drift and outliers not included.
@@ -142,7 +143,7 @@ def measure(
 def wandering(measured: Positions, drift: float, seed: int, begin: float = 0.0) -> Positions:
     """Return measured positions with an instrument drift added: `drift` [m] from `begin` (0 to 1) to the end.
 
-    The direction is the seed's, so that several series can share it.
+    The direction follows from `seed`, so that several series can share it.
     """
     direction = np.random.default_rng([seed, 5]).standard_normal(3)
     share = np.linspace(begin, 1.0, len(measured))[:, None]
@@ -196,7 +197,7 @@ def write_measured(measured: Positions, path: str | Path, degrees: bool = True) 
 
     Args:
         measured: positions or poses of one target; every joint revolute where `degrees`.
-        path: of the file.
+        path: path of the file.
         degrees: False for SI units throughout.
     """
     angle, length = 1.0, 1.0
@@ -220,7 +221,8 @@ def write_measured(measured: Positions, path: str | Path, degrees: bool = True) 
 
 
 def write_log(recording: Recording, path: str | Path, degrees: bool = True) -> Path:
-    """Write a recording as CSV: ``t [s]``, ``q_joint [deg]``, ``tau_joint [Nm]`` and, of sensors, ``tau_link_joint``.
+    """Write a recording as CSV: ``t [s]``, ``q_joint [deg]``, ``tau_joint [Nm]`` and, for torque sensors,
+    ``tau_link_joint``.
 
     Seven digits, as controllers log.
     """

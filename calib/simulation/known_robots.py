@@ -27,7 +27,7 @@ def _fourier(
 
     Args:
         centre: (n,) q_i0.
-        sines, cosines: (n, h) a and b.
+        sines, cosines: (n, h) coefficients a and b.
         base: ω [rad/s].
         duration, rate: [s], [Hz].
     """
@@ -59,7 +59,7 @@ def random_fourier(
 
     Args:
         lower, upper, velocity: (n,) limits, kept everywhere on the grid of `rate`.
-        acceleration: largest in any joint.
+        acceleration: largest acceleration of any joint [rad/s² or m/s²].
     """
     lower = np.asarray(lower, dtype=float)
     upper = np.asarray(upper, dtype=float)
@@ -98,9 +98,9 @@ def trapezoidal(
     The slowest joint sets the duration of a move; the others accelerate for the same share of it.
 
     Args:
-        points: (P, n).
+        points: (P, n) joint values [rad or m].
         velocity, acceleration: (n,) limits.
-        pause: at rest after every move and before the first [s].
+        pause: time at rest after every move and before the first [s].
     """
     points = shaped(points, (None, None), "points")
     n = points.shape[1]

@@ -59,13 +59,13 @@ def render(
     """Return the rendered 8-bit image (height, width) of a board.
 
     Args:
-        board: what was printed.
-        lens: of the camera.
-        poses: (4, 4) of the board in the camera's frame, or several (k, 4, 4) that the exposure runs through evenly:
-            motion blur.
+        board: the printed board.
+        lens: lens of the camera.
+        poses: pose (4, 4) of the board in the camera's frame, or poses (k, 4, 4) passed at even times during the
+            exposure (motion blur).
         imaging: light, focus and noise.
-        seed: of the noise.
-        shape: of the print: scale and bending.
+        seed: seed of the noise.
+        shape: shape of the print (scale and bending); None for an exact print.
     """
     imaging = imaging or Imaging()
     shape = shape or BoardShape()

@@ -34,7 +34,7 @@ DEFAULT_SPEED = 2.0
 def position_errors(cell: Cell, calibrated: Installation, urdf: Chain) -> tuple[float, float, float]:
     """Return the rms position error [mm] of nominal arm, calibrated arm and URDF over `TRUTH` noise-free poses.
 
-    The nominal arm and the URDF get their best station and tool for these very poses, so that arms are compared.
+    Station and tool of the nominal arm and of the URDF are fitted to these poses, so that only the arms are compared.
 
     Args:
         cell: the virtual cell.
@@ -74,8 +74,9 @@ class TorqueComparison:
 
     Attributes:
         identified: 100 ‖τ̂ - τ‖ / ‖τ‖ by the identified model, over all rows [%].
-        joints: (rows,) rms [N m or N].
-        nominal: error behind the gears by the nominal masses on the nominal geometry, the true friction given [%].
+        joints: (rows,) rms error of each row [N m or N].
+        nominal: relative error of the torques behind the gears, computed from nominal masses and geometry with the true
+            friction [%].
     """
 
     identified: float
@@ -89,10 +90,10 @@ def torque_errors(
     """Return the errors of a model's torques against noise-free torques along a random validation motion.
 
     Args:
-        cell, arm: the virtual cell, and its arm as it moves.
-        model: as identified, with values (p,) of its parameters.
+        cell, arm: the virtual cell and its moving arm.
+        model: the identified model; values: (p,) of its parameters.
         chain: the calibrated arm, whose limits the motion keeps.
-        seed: of the motion.
+        seed: seed of the motion.
     """
     lower, upper = chain.sampling_limits()
     speed = np.array([joint.velocity for joint in chain.joints])
@@ -126,8 +127,8 @@ def share_within(true: Mapping[str, float], estimate: Sequence[EstimateRow]) -> 
     """Return the share of estimated parameters within two σ of the truth, and the number of parameters compared.
 
     Args:
-        true: values by name, as `true_base` returns; parameters without one, or without sigma, are not counted.
-        estimate: with sigmas; an R behind a name (regrouped) is not part of it.
+        true: true values by name, as `true_base` returns them; parameters without true value or sigma are not counted.
+        estimate: rows of the estimate with sigmas; a final R of a name (regrouped) is ignored.
     """
     within = []
     for row in estimate:

@@ -39,7 +39,7 @@ PRISMATIC_SHARE = 0.3
 
 
 def _named(effects: Sequence[str]) -> str:
-    """Return the names of effects as the end of a sentence; empty without any."""
+    """Return the names of effects as the end of a sentence; "" for no effects."""
     if not effects:
         return ""
     return f"; unmodelled: {', '.join(effects)}"
@@ -50,11 +50,11 @@ class PositionErrors:
     """Sizes of the simulated position errors.
 
     Attributes:
-        gear: a, of the two gear errors each [rad; 0.3 of it in m for a prismatic joint].
-        backlash: b [rad].
-        growth: g, of all lengths when warm.
-        droop: d [m].
-        seed: of the phases and of the direction in which the tool gives way.
+        gear: a, amplitude of each of the two gear errors [rad; 0.3 times that value in m for a prismatic joint].
+        backlash: b, half-width of the backlash [rad].
+        growth: g, relative growth of all lengths when warm.
+        droop: d, droop of the tool [m].
+        seed: seed of the phases and of the direction of the droop.
     """
 
     gear: float = 0.0
@@ -65,7 +65,7 @@ class PositionErrors:
 
     @property
     def note(self) -> str:
-        """What they are, as the end of a sentence; empty where there are none."""
+        """The effects, as the end of a sentence; empty without effects."""
         effects = []
         if self.gear:
             effects.append(f"gear errors of {self.gear * 1e3:.2g} mrad that depend on load and on the next joint")
@@ -84,11 +84,11 @@ def displacements(
     """Return the error (K, m) [rad or m] that the effects add to each element of a chain.
 
     Args:
-        errors: their sizes.
+        errors: sizes of the effects.
         chain: the true arm of n joints.
         q: (m, n) joint values of a series in its order [rad or m].
         torque: (m, n) gravity torques [N m or N].
-        warm: how many poses the arm has moved to before; infinite for a warm arm.
+        warm: number of poses to which the arm has moved before; infinite for a warm arm.
     """
     rng = np.random.default_rng([errors.seed, 11])
     phases = rng.uniform(0.0, 2.0 * np.pi, (2, chain.n))
@@ -146,11 +146,11 @@ class TorqueErrors:
     """Sizes of the simulated torque errors; zero by default.
 
     Attributes:
-        memory: Σ_k f_k, of the Coulomb friction.
-        warming: w.
-        ripple: r.
-        cable: c, of the torque limit.
-        push: σ of a torque that acts and is not recorded, of the torque limit.
+        memory: Σ_k f_k, as a share of the Coulomb friction.
+        warming: w, share of the friction that vanishes as the gears warm up.
+        ripple: r, relative ripple of the gear torque.
+        cable: c, as a share of the torque limit.
+        push: σ of an unrecorded external torque, as a share of the torque limit.
     """
 
     memory: float = 0.0
@@ -161,7 +161,7 @@ class TorqueErrors:
 
     @property
     def note(self) -> str:
-        """What they are, as the end of a sentence; empty where there are none."""
+        """The effects, as the end of a sentence; empty without effects."""
         effects = []
         if self.memory:
             effects.append(f"friction hysteresis (presliding), {self.memory:.0%} of Fc")
@@ -186,7 +186,7 @@ def gear_torques(
     """Return the unmodelled torques (N, n) of gears and motors [N m or N].
 
     Args:
-        errors: their sizes.
+        errors: sizes of the effects.
         q: (N, n) in the order in which they are passed, finely sampled [rad or m].
         drive: (N, n) the motors' torques.
         coulomb: (n,) Fc.

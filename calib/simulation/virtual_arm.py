@@ -2,9 +2,9 @@
 
     tau_l = Y(q, v, a) φ + Fvl v + Fcl sign(v) + offl,    tau = tau_l + Ia a + Fvm v + Fcm sign(v) + offm,
 
-the first seen by sensors behind the gears, the second by the motors, each plus what no model holds (`unmodelled`).
-True inertias are the library's, made wrong body by body in a way that keeps every one possible, so that the nominal
-masses, which a calibration is given, are off.
+the first being measured by sensors behind the gears, the second by the motors, each plus unmodelled torques
+(`unmodelled`). True inertias are the library's, perturbed body by body such that each remains physically consistent, so
+that the nominal masses given to a calibration are wrong.
 """
 
 from dataclasses import dataclass, replace
@@ -52,10 +52,10 @@ class MovingArm:
     Attributes:
         chain: the true arm, its true inertias included.
         plant: chain and drives, motors' torques; `link` sees the same terms behind the gears.
-        gains: of the controller, which feeds forward what `believed` needs at low accelerations.
-        effort: (n,) limits that the noise of the torques is a share of [N m or N].
-        note: what the truth is made of.
-        unmodelled: torques that no parameter of an identification holds.
+        gains: gains of the controller and of its feedforward.
+        effort: (n,) torque limits, to which the torque noise is proportional [N m or N].
+        note: sentence on how the truth was generated.
+        unmodelled: torques that no parameter of an identification describes.
         sensors: whether torque sensors behind the gears are recorded, too.
     """
 
@@ -85,13 +85,13 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors =
     """Return the simulated real arm of a cell, with its dynamics, controller and sensors.
 
     Args:
-        cell: whose true geometry it has.
-        robot: its name in the library.
-        seed: of what is wrong with the nominal masses.
-        unmodelled: torques that no model holds.
+        cell: the cell whose true geometry the arm has.
+        robot: name of the robot in the library.
+        seed: seed of the errors of the nominal masses.
+        unmodelled: torques that no model describes.
 
     Raises:
-        CalibError: where the library holds no masses for it.
+        CalibError: if the library has no masses for the robot.
     """
     nominal = cell.nominal
     if nominal.inertias is None:
@@ -151,7 +151,7 @@ def play(t: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray, repeats: in
 
     Args:
         t: (N,), even steps [s].
-        q, v, a: (N, n).
+        q, v, a: (N, n) positions, velocities and accelerations.
     """
     rate = (len(t) - 1) / (t[-1] - t[0])
     still = np.zeros((round(REST * rate), q.shape[1]))
@@ -172,13 +172,13 @@ def record(
     """Return a simulated recording of a motion: encoders, motor torques and, where the arm has any, torque sensors.
 
     Args:
-        arm: what moves.
-        reference: what it is to follow.
-        seed: of the noise.
-        running: for how long the arm has moved before [s]; infinite for a warm one.
+        arm: the moving arm.
+        reference: the motion to follow.
+        seed: seed of the noise.
+        running: time for which the arm has moved before [s]; infinite for a warm arm.
 
     Raises:
-        NotConverged: where the loop is unstable.
+        NotConverged: if the control loop is unstable.
     """
     rng = np.random.default_rng(seed)
     # the controller feeds forward the torques at low accelerations

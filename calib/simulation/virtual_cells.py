@@ -36,7 +36,7 @@ def deflection(chain: Chain, compliance: np.ndarray, amplitude: np.ndarray, seed
         chain: the true arm.
         compliance: (n,) [rad/(N m)].
         amplitude: (n,) of each harmonic [rad, or m for a prismatic joint].
-        seed: of the phases φ.
+        seed: seed of the harmonics' phases.
     """
     rng = np.random.default_rng(seed)
     phases = rng.uniform(0.0, 2.0 * np.pi, (chain.n, len(ORDERS)))
@@ -57,9 +57,9 @@ def virtual_cell(robot: str = "lwr4plus", seed: int = 0, instrument: SimulatedIn
     """Return the simulated cell of a robot: the study's for the LWR4+, otherwise a perturbed one by seed.
 
     A third of what is hidden, in squares at the tool (LWR4+: 0.34 of 0.65 mm rms, UR5: 0.08 of 0.13 mm), is of kinds
-    that no model of this toolkit holds (`UNMODELLED`). Perturbed arms err as real ones do: the TX40 of seeds 0 to 9 by
-    0.6 to 2.3 mm rms before and 0.08 to 0.12 mm after, a UR5, a UR10 and a Motoman by 0.24 to 0.84 and 0.06 to 0.09 mm
-    (``examples/real_recordings.md``), an ABB IRB 1600 by up to 0.65 mm before (Slamani, Nubiola & Bonev 2012).
+    that no model of this toolkit describes (`UNMODELLED`). Perturbed arms err as real ones do: the TX40 of seeds 0 to 9
+    by 0.6 to 2.3 mm rms before and 0.08 to 0.12 mm after, a UR5, a UR10 and a Motoman by 0.24 to 0.84 and 0.06 to 0.09
+    mm (``examples/real_recordings.md``), an ABB IRB 1600 by up to 0.65 mm before (Slamani, Nubiola & Bonev 2012).
     """
     if robot == "lwr4plus":
         return lwr4plus_cell(instrument, MODELLED, UNMODELLED)
@@ -76,9 +76,9 @@ def lwr4plus_cell(
     Table 1 leave about the paper's 0.80 mm and 0.10 deg (Table 3) on poses they have not seen.
 
     Args:
-        instrument: what measures; the paper's by default.
+        instrument: the instrument; the paper's by default.
         hidden: scale of the hidden part; 0 for a rigid arm.
-        unmodelled: what no model holds.
+        unmodelled: errors that no model describes.
     """
     _, calibrated = lwr4plus.table_2()
     true = lwr4plus.arm(calibrated)
@@ -109,11 +109,11 @@ def perturbed_cell(
 
     Args:
         nominal: the arm as it is described.
-        seed: of the deviations, the placements and the hidden part.
-        instrument: what measures.
+        seed: seed of the deviations, the placements and the hidden part.
+        instrument: the instrument.
         size: scale of the deviations (`LENGTH`, `ANGLE`; `OFFSET` for joint offsets).
         hidden: scale of the hidden deflections, in those of the LWR4+.
-        unmodelled: what no model holds.
+        unmodelled: errors that no model describes.
     """
     rng = np.random.default_rng(seed)
     true = _perturbed(nominal, rng, size)

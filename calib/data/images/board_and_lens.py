@@ -5,8 +5,9 @@ the reprojection error. Seen from afar a plane has a second pose of nearly the s
 the line of sight (Schweighofer & Pinz 2006): both are refined, the better is taken.
 
 Lens: Zhang's (2000) problem, min over lens and one pose per image of the reprojection error, by variable projection
-(Golub & Pereyra 1973; Kaufman 1975): for a lens every image has its own best pose, and what a QR of its rows leaves
-beyond those six columns is a least-squares problem in the lens alone. The focal length starts at the best of a few.
+(Golub & Pereyra 1973; Kaufman 1975): for a given lens every image has its own best pose; a QR of the image's rows
+eliminates the six pose columns, which leaves a least-squares problem in the lens alone. The focal length starts at the
+best of a few tried values.
 """
 
 from contextlib import suppress
@@ -51,9 +52,10 @@ class BoardPoses:
     """Board poses (PnP) in m images, with their reprojection errors.
 
     Attributes:
-        poses: (m, 4, 4) of the board in the camera's frame.
+        poses: (m, 4, 4) poses of the board in the camera's frame.
         rms: (m,) reprojection error per coordinate [px]; NaN where there are too few corners.
-        information: (m, 6, 6) JᵀJ [px²] of [v; ω] in the camera's axes, about the board's origin.
+        information: (m, 6, 6) JᵀJ with J the derivative of the corners [px] by the board's twist [v; ω] in the camera's
+            axes, about the board's origin.
     """
 
     poses: np.ndarray
@@ -65,8 +67,8 @@ def board_poses(lens: Lens, board: Board, pixel: np.ndarray) -> BoardPoses:
     """Return the pose of the board in the camera's frame for each image, from its corners [px].
 
     Args:
-        lens: of the camera.
-        board: what was seen.
+        lens: lens of the camera.
+        board: the board in the images.
         pixel: (m, K, 2) corners [px], NaN where not seen.
     """
     table = corners(board)
@@ -174,17 +176,18 @@ def _normal(
 def estimate_lens(
     board: Board, pixel: np.ndarray, size: tuple[int, int], model: str = "pinhole", file: str = ""
 ) -> Lens:
-    """Return the lens estimated from images (m, K, 2) [px] of a flat board.
+    """Return the lens estimated from images (m, K, 2) of a flat board.
 
     Args:
-        board: what was seen.
-        pixel: corners, NaN where not seen.
+        board: the board in the images.
+        pixel: (m, K, 2) corners [px], NaN where not seen.
         size: width and height of the images [px].
         model: ``pinhole`` or ``fisheye``.
-        file: for messages.
+        file: name of the file or folder, for messages.
 
     Raises:
-        MeasurementError: too few images, or all from one direction, so that the focal length cannot be determined.
+        MeasurementError: if there are too few images, or all show the board from one direction, so that the focal
+            length is undetermined.
     """
     corner_counts = (~np.isnan(pixel[:, :, 0])).sum(axis=1)
     good = np.flatnonzero(corner_counts >= 8)
@@ -269,7 +272,7 @@ def _fitted(board: Board, pixel: np.ndarray, size: tuple[int, int], model: str) 
 
 
 def _squares(rows: np.ndarray) -> float:
-    """Return the sum of squared residuals (last column of `rows`); infinite if the projection is not valid."""
+    """Return the sum of squared residuals (last column of `rows`); infinite if any residual is not finite."""
     residual = rows[:, FITTED]
     return float(np.nan_to_num(residual @ residual, nan=np.inf))
 

@@ -67,7 +67,7 @@ def _rectangles(dark: np.ndarray, x: float, y: float, side: float) -> np.ndarray
 def raster(board: Board, pixels_per_metre: float, margin: float) -> np.ndarray:
     """Return the image (H, W) of a board with a white margin [m]: reflectances, 0 black to 1 white.
 
-    Every pixel holds the share of its area that is white, so that edges lie where they belong.
+    Every pixel's value is the white share of its area, so that edges are exact to sub-pixels.
     """
     width, height = (round((length + 2.0 * margin) * pixels_per_metre) for length in board.extent)
     image = np.ones((height, width), dtype=np.float32)
@@ -91,7 +91,7 @@ def page_size(board: Board, paper: str = "") -> tuple[float, float]:
     """Return width and height [m] of the page that the board fits on: the stated paper, or the smallest one.
 
     Raises:
-        UsageError: where the board does not fit, with the largest square that would.
+        UsageError: if the board does not fit on the page; the message states the largest square that fits.
     """
     needed = board.extent[0] + 2 * EDGE, board.extent[1] + 2 * EDGE + RULER
     papers = [PAPERS[paper]] if paper else list(PAPERS.values())

@@ -1,4 +1,4 @@
-"""How much of the image the corners of a board cover, and what is said of images as they arrive."""
+"""Coverage of the image by a board's corners, and the summary sentence on images that were read."""
 
 import numpy as np
 

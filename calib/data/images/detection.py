@@ -2,7 +2,7 @@
 
 Markers are found in an image of some `max_pixels` pixels; corners are then refined in the full one by the orthogonality
 of gradients (Förstner & Gülch 1987; OpenCV's cornerSubPix). A corner's standard deviation is the Cramér–Rao bound of
-its patch, n² (Σ g gᵀ)⁻¹ with grey-level noise n and gradients g, and a floor.
+its patch, n² (Σ g gᵀ)⁻¹ with grey-level noise n and gradients g, with a lower bound.
 """
 
 from collections import Counter
@@ -41,8 +41,8 @@ def detect(image: np.ndarray, board: Board, thorough: bool = True) -> Detection:
 
     Args:
         image: (height, width) 8-bit grey.
-        board: what to look for.
-        thorough: where nothing is found, look for other boards and mirrored ones, to say so.
+        board: the board to look for.
+        thorough: whether, if the board is not found, to look for other and mirrored boards, which `problem` then names.
     """
     table = corners(board)
     min_corners = min(MIN_CORNERS, len(table))
@@ -83,7 +83,7 @@ def detect(image: np.ndarray, board: Board, thorough: bool = True) -> Detection:
 
 
 def _coarse(image: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray]:
-    """Return corner numbers (n,) and pixels (n, 2) before refinement."""
+    """Return the numbers (n,) and pixels (n, 2) of the detected corners, before refinement."""
     nothing = np.zeros(0, dtype=int), np.zeros((0, 2))
     if board.kind == "chessboard":
         columns, rows = board.columns - 1, board.rows - 1
@@ -133,7 +133,7 @@ def _upright(image: np.ndarray, pixels: np.ndarray, board: Board) -> np.ndarray:
 def _consistent(
     ids: np.ndarray, pixels: np.ndarray, table: np.ndarray, board: Board
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the corners consistent with a plane, and the side of a square [px]."""
+    """Return numbers (n,) and pixels (n, 2) of the corners consistent with a plane, and the side of a square [px]."""
     points = table[ids, None, :2]
     plane, _ = cv2.findHomography(points[:, 0], pixels, cv2.RANSAC, 8.0)
     if plane is None:
@@ -196,7 +196,9 @@ def _quality(image: np.ndarray, pixels: np.ndarray, floor: float, spacing: float
 
 
 def _widths(horizontal: np.ndarray, vertical: np.ndarray, contrast: float) -> tuple[float, float]:
-    """Return the widths [px] of the two edges crossing in a patch: contrast divided by each steepest gradient."""
+    """Return the widths [px] of the two edges crossing in a patch: contrast divided by the steepest gradient across
+    each.
+    """
     size = np.hypot(horizontal, vertical)
     steepest = np.unravel_index(int(np.argmax(size)), size.shape)
     steepest_size = float(size[steepest])
@@ -279,7 +281,7 @@ def detected(
 ) -> Found:
     """Detect a board in images (files or arrays) and return the corners by image name.
 
-    Images of another size than most are of no use: a camera's lens is that of one size.
+    Images whose size differs from that of most images are marked as unusable: a lens is valid for one image size.
     """
     detections = dict[str, Detection]()
     sizes = dict[str, tuple[int, int]]()

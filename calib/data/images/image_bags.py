@@ -56,11 +56,11 @@ class ImageBag:
     """Usable images of a bag with corners and joint values.
 
     Attributes:
-        names: of the images kept.
+        names: names of the images kept.
         joint_names: as in the bag.
         q: (m, n) joint values of the images kept [rad or m].
-        corners: what was found in them.
-        notes: what was left out.
+        corners: detected corners of the images kept.
+        notes: sentences on the images that were left out.
     """
 
     names: tuple[str, ...]
@@ -80,13 +80,13 @@ def read_image_bag(
     """Return the detected corners and the joint values of a bag's images.
 
     Args:
-        path: of the bag (a file, or the folder of a ROS 2 bag).
-        board: to look for.
-        image_topic, joint_topic: where there are several.
+        path: path of the bag (a file, or the folder of a ROS 2 bag).
+        board: the board to look for.
+        image_topic, joint_topic: topics to read; needed only where the bag has several of a kind.
         say: called with the number and the name of each image.
 
     Raises:
-        MeasurementError: where it cannot be read, a topic is missing, or no image was taken at rest.
+        MeasurementError: if the bag cannot be read, a topic is missing, or no image was taken at rest.
     """
     with opened(path) as reader:
         states = connections_of(reader, JOINT_STATE, joint_topic, path, "joint states", "--joint-topic")

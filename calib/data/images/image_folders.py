@@ -50,13 +50,13 @@ def read_images(
     """Return the measurements of a folder of images for a robot with these joints.
 
     Args:
-        path: of the folder.
-        joints: as `calib.data.poses.pose_files.read_measurements`.
-        options: see there; [camera] is about images.
+        path: the folder.
+        joints: the robot's joints, or their names, as in `calib.data.poses.pose_files.read_measurements`.
+        options: options for reading; their table [camera] concerns images.
         progress: called with (done, total, image).
 
     Raises:
-        MeasurementError: where a file is missing or cannot be, or no three images are of use.
+        MeasurementError: if a file is missing or invalid, or fewer than three images are usable.
     """
     path = Path(path)
     robot = Joints.of(joints)
@@ -100,7 +100,7 @@ def read_own_board(path: Path) -> Board:
     """Return the board of the folder's ``board.toml``.
 
     Raises:
-        MeasurementError: where there is none.
+        MeasurementError: if there is no such file.
     """
     message = f"has no {BOARD}, which describes the board: copy the one that calib board wrote into it"
     require((path / BOARD).is_file(), message, MeasurementError, path)
@@ -120,12 +120,12 @@ def joint_table(path: Path) -> Table:
 
 
 def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progress | None = None) -> Found:
-    """Return the corners of a folder's images: from ``corners.csv`` where that is newer, else by looking at them.
+    """Return the corners of a folder's images: from ``corners.csv`` if newer than the images, else by detection.
 
     Args:
-        path: of the folder.
-        board: to look for.
-        names: of the images.
+        path: the folder.
+        board: the board to look for.
+        names: file names of the images.
         progress: called with (done, total, image).
     """
     stored = path / CORNERS
@@ -152,7 +152,7 @@ def find_corners(path: Path, board: Board, names: Sequence[str], progress: Progr
 
 
 def _usable(names: Sequence[str], detection: Found, path: Path) -> tuple[np.ndarray, list[str]]:
-    """Return the table's rows whose images are usable, and sentences on the others."""
+    """Return the rows of ``joints.csv`` whose images are usable, and sentences on the unusable images."""
     missing = [name for name in names if name not in detection.images]
     problems = {name: detection.images[name].problem for name in names if name in detection.images}
     rows = np.array([k for k, name in enumerate(names) if problems.get(name) == ""], dtype=int)
@@ -174,7 +174,7 @@ def _usable(names: Sequence[str], detection: Found, path: Path) -> tuple[np.ndar
 
 
 def problem_words(problems: Mapping[str, str]) -> list[str]:
-    """Return a sentence per reason why images are unusable, with image names and the range of its numbers."""
+    """Return a sentence per reason why images are unusable, with the names of the images concerned."""
     reasons: dict[str, list[str]] = {}
     for name, problem in problems.items():
         if problem:
@@ -192,7 +192,9 @@ def problem_words(problems: Mapping[str, str]) -> list[str]:
 
 
 def _own_lens(path: Path, size: tuple[int, int], options: FileOptions) -> tuple[Lens | None, bool]:
-    """Return the folder's lens and whether it was given; None if the lens must be estimated from the images."""
+    """Return the folder's lens and whether it was given by the user; None if the lens must be estimated from the
+    images.
+    """
     file = path / LENS
     if not file.is_file():
         if options.camera.intrinsics == "given":
@@ -240,10 +242,10 @@ def _images(folder: Path) -> list[str]:
 
 
 def detection_summary(detection: Found, board: Board, names: Iterable[str]) -> list[str]:
-    """Return sentences on detected corners: how many images are usable, why others are not, what they cover.
+    """Return sentences on detected corners: number of usable images, reasons for unusable ones, coverage of the image.
 
     Raises:
-        MeasurementError: where none is of use, with the reasons.
+        MeasurementError: if no image is usable, with the reasons.
     """
     usable = [image for image in detection.images.values() if not image.problem]
     total = len(corners(board))

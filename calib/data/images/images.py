@@ -16,7 +16,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".webp")
 def read_image(path: Path) -> np.ndarray:
     """Return an image (height, width) as 8-bit grey.
 
-    An EXIF orientation is not followed: it turns the picture for people, and would turn the camera's axes with it.
+    An EXIF orientation is ignored, since rotating the picture would rotate the camera's axes.
 
     Raises:
         MeasurementError: for a file that is missing, empty or damaged.
@@ -29,7 +29,7 @@ def read_image(path: Path) -> np.ndarray:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Keep OpenCV from writing to the terminal: this toolkit reports errors itself."""
+    """Keep OpenCV from writing to the terminal within the context: this toolkit reports errors itself."""
     before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     try:
         yield
@@ -41,7 +41,7 @@ def decode(content: bytes) -> np.ndarray:
     """Return a compressed image's grey levels (height, width), 8 bits; see `read_image`.
 
     Raises:
-        ValueError: where it is none.
+        ValueError: if the content is no image.
     """
     require(content, "the file is empty", ValueError)
     if content.startswith(PNG) and b"IEND" not in content[-64:]:  # libpng would complain on its own

@@ -48,8 +48,8 @@ class Lens:
 
     Attributes:
         model: ``pinhole`` or ``fisheye``.
-        values: fx fy cx cy [px] and the distortion's coefficients, as `NAMES`; a pinhole has 9 or 12.
-        size: width and height of its images [px].
+        values: fx fy cx cy [px] and the distortion coefficients, in the order of `NAMES`; 9 or 12 values for a pinhole.
+        size: width and height of the camera's images [px].
     """
 
     model: str
@@ -76,7 +76,8 @@ class Lens:
     def in_sight(self, points: np.ndarray, margin: float = 0.0) -> np.ndarray:
         """Return whether points (N, 3) [m] project into the image, at least `margin` [px] from its edge: (N,) bool.
 
-        A point beyond the angle at which the distortion's polynomial turns back is out of sight, wherever it falls.
+        A point beyond the angle at which the distortion polynomial ceases to increase is out of sight, wherever it
+        projects.
         """
         ahead = points[:, 2] > 1e-6
         safe = np.where(ahead[:, None], points, [0.0, 0.0, 1.0])
@@ -96,7 +97,7 @@ class Lens:
         return self.project_with_slopes(points)[0]
 
     def project_with_slopes(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return pixels (N, 2), ∂pixel/∂point (N, 2, 3) [px/m] and ∂pixel/∂values (N, 2, k)."""
+        """Return pixels (N, 2), ∂pixel/∂point (N, 2, 3) [px/m] and ∂pixel/∂values (N, 2, k) for points (N, 3) [m]."""
         depth = points[:, 2]
         focal, centre = self.values[:2], self.values[2:4]
         plane = points[:, :2] / depth[:, None]
@@ -191,7 +192,7 @@ def read_lens(path: str | Path) -> Lens:
     """Return the lens of a ``camera_info`` file.
 
     Raises:
-        MeasurementError: naming the key that is missing or cannot be.
+        MeasurementError: for a key that is missing or invalid, named in the message.
     """
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
@@ -224,7 +225,7 @@ def read_lens(path: str | Path) -> Lens:
 
 
 def _entry(table: dict[str, object], keys: tuple[str, ...]) -> object:
-    """Return the value of the first of some keys that a table has; None without any."""
+    """Return the value of the first of some keys that a table has; None if it has none of them."""
     for key in keys:
         if key in table:
             return table[key]

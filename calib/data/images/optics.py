@@ -1,7 +1,7 @@
 """Calibration parameters of images: lenses and shapes of printed boards, with derivatives.
 
-A corner (x, y, 0) of the table stands on the board at (s x, s y, w), w = b₁ X² + b₂ XY + b₃ Y² with X, Y counted
-from the board's middle: s is the scale of the print, b how the board bends [1/m]. In ``robot.toml`` of a fit::
+A nominal corner (x, y, 0) lies on the printed board at (s x, s y, w), w = b₁ X² + b₂ XY + b₃ Y² with X, Y measured from
+the board's centre: s is the scale of the print, b the curvature of the board [1/m]. In ``robot.toml`` of a fit::
 
     [[camera]]                       # its lens
     name = "camera"
@@ -103,7 +103,9 @@ class Optics:
         return sum(len(lens.values) for lens in self.lenses) + len(SHAPE) * len(self.boards)
 
     def with_values(self, values: np.ndarray) -> Optics:
-        """Return the optics with other parameter values; a focal length changes by at most half of its value."""
+        """Return the optics with other parameter values; each focal length is limited to a change by half of its
+        present value.
+        """
         lenses, start = [], 0
         for lens in self.lenses:
             lens_values = np.array(values[start : start + len(lens.values)])
@@ -115,7 +117,7 @@ class Optics:
         return replace(self, lenses=tuple(lenses), boards=boards)
 
     def like(self, source: Optics) -> Optics:
-        """Return these optics with the values of other optics (same lens model, same board), not to be fitted."""
+        """Return these optics with the values of other optics (same lens model, same board); no parameter is free."""
         lens_by_kind = {(lens.model, lens.size): lens for lens in reversed(source.lenses)}
         lenses = tuple(lens_by_kind.get((lens.model, lens.size), lens) for lens in self.lenses)
         shapes = dict(zip(source.board_names, source.boards))
@@ -173,7 +175,7 @@ def read_optics(cameras: Sequence[Mapping[str, object]], boards: Sequence[Mappin
     """Return the cameras and boards of the tables ``camera`` and ``board`` of a fit's ``robot.toml``.
 
     Raises:
-        ValueError, CalibError: for a table that is not one.
+        ValueError, CalibError: for an invalid table.
     """
     lenses = read_record(tuple[_Camera, ...], cameras)
     shapes = read_record(tuple[_Board, ...], boards)
@@ -190,9 +192,9 @@ class View:
     """Lens and board shape that predict one block of images.
 
     Attributes:
-        lens, shape: of the camera and the board.
-        in_view: (k,) which of their values (the lens's, then the board's) are among the free parameters.
-        in_free: (k,) where those stand among the f free parameters.
+        lens, shape: lens of the camera, and shape of the board.
+        in_view: (k,) indices of the fitted values among the lens's values followed by the board's.
+        in_free: (k,) positions of these k values among the f free parameters of the fit.
     """
 
     lens: Lens

@@ -25,20 +25,20 @@ from calib.errors import MeasurementError, refuse_data, refused_as
 class Pixels(PoseMeasurements):
     """Measured pixel positions of a board's corners in m images.
 
-    The camera in the hand: the arm carries the camera (``tool``), ``station`` is the board's place. The camera to the
-    hand: the arm carries the board (``tool``), ``station`` is the camera's place.
+    Mounting in hand: the arm carries the camera (``tool``), and ``station`` is the board's placement. Mounting to hand:
+    the arm carries the board (``tool``), and ``station`` is the camera's placement.
 
     Attributes:
-        pixel: (m, K, 2) corners of the board's table [px]; NaN where not seen.
+        pixel: (m, K, 2) pixels of the board's K corners [px]; NaN where not seen.
         board: the board.
-        lens: of the camera, where known beforehand or estimated from images.
-        mounting: ``in hand`` or ``to hand``; empty where it is yet to be found.
+        lens: lens of the camera, given or estimated from images; None where not known yet.
+        mounting: ``in hand`` or ``to hand``; empty where not known yet.
         sigma: (m, K) standard deviation of a coordinate [px].
-        names: of all images of the file; ``rows`` count them from 1.
+        names: names of all images of the folder; ``rows`` number them from 1.
         size: width and height of the images [px]; 0, 0 where unknown.
-        model: of a lens that is yet to be found.
-        known: whether the lens was given, and not found from these images.
-        free: what is fitted of the lens (``fx`` …) and of the board (``scale``, ``bend_xx`` …).
+        model: lens model (``pinhole``, ``fisheye``) for a lens that is to be estimated.
+        known: whether the lens was given instead of estimated from these images.
+        free: names of the fitted parameters of the lens (``fx`` …) and of the board (``scale``, ``bend_xx`` …).
     """
 
     pixel: np.ndarray
@@ -68,7 +68,7 @@ class Pixels(PoseMeasurements):
 
     @property
     def camera(self) -> str:
-        """Name of the camera among an installation's lenses: the tool or station that holds it."""
+        """Name of the camera among an installation's lenses: that of the tool or station where it is mounted."""
         return self.tool_names[0] if self.mounting == IN_HAND else self.station
 
     @property
@@ -95,9 +95,9 @@ class Detection:
     """Corners detected in one image.
 
     Attributes:
-        pixel: (K, 2) of each corner of the board; NaN where it was not seen.
+        pixel: (K, 2) pixel of each corner of the board; NaN where not seen.
         sigma: (K,) standard deviation of each coordinate [px].
-        problem: why the image is not usable; empty if it is.
+        problem: reason why the image is not usable; empty if it is usable.
         edge: median width of the edges [px]; NaN without a board.
     """
 
@@ -136,7 +136,7 @@ def read_corners(path: Path, board: Board) -> Found:
     """Return the detections of a ``corners.csv`` for a board.
 
     Raises:
-        MeasurementError: for corners that the board does not have.
+        MeasurementError: for corner numbers that the board does not have.
     """
     import csv
 

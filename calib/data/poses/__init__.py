@@ -1,4 +1,4 @@
-"""Names of models, losses and files of a geometric fit; imports little, so that the command line starts at once."""
+"""Names of models, losses and files of a geometric fit; imports little, so that the command line starts fast."""
 
 from pathlib import Path
 from typing import Annotated

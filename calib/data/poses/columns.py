@@ -1,4 +1,4 @@
-"""Columns of a measurement file: which quantity each of them contains, by its name and the options."""
+"""Columns of a measurement file: the quantity in each column, recognised by the column's name and the options."""
 
 import re
 from collections.abc import Sequence
@@ -48,9 +48,9 @@ class Sheet:
     """A table of a file, and the options for reading it.
 
     Attributes:
-        table: as the file has it.
+        table: the table as read from the file.
         options: names and units that the header does not state.
-        suffixes: allowed endings of our names in a family of columns.
+        suffixes: allowed suffixes of the toolkit's names in a family of columns.
     """
 
     table: Table
@@ -58,7 +58,7 @@ class Sheet:
     suffixes: tuple[str, ...] = SUFFIXES
 
     def fail(self, message: str, column: str | None = None) -> NoReturn:
-        """Raise the error for the file, or for one of its columns."""
+        """Raise MeasurementError about the file, or about one of its columns."""
         self.table.fail(message, column)
 
     def find(self, name: str) -> str:
@@ -79,7 +79,9 @@ class Sheet:
         return ""
 
     def numbers(self, names: Sequence[str], column: Column, gaps: bool = False) -> np.ndarray:
-        """Return columns (m, k) in SI, checked against the bounds of `column`; a gap is NaN."""
+        """Return columns (m, k) in SI, checked against the bounds of `column`; with `gaps`, an empty cell becomes NaN,
+        otherwise it is refused.
+        """
         values = []
         for name in names:
             unit = self._unit_of_options(name, column.family)
@@ -113,7 +115,8 @@ class Sheet:
     def find_joints(self, joints: Sequence[str]) -> tuple[str, ...]:
         """Return the file's names of the joint columns in the robot's order.
 
-        Accepted: the robot's joint names, ``q_<joint name>``, or ``q1`` to ``qn``; the first of these that occurs.
+        Accepted are the robot's joint names, ``q_<joint name>``, or ``q1`` to ``qn``; the first of these forms that
+        occurs is used.
         """
         n, table, mapping = len(joints), self.table, self.options.columns
         numbered = tuple(f"q{i + 1}" for i in range(n))
@@ -147,10 +150,11 @@ class Sheet:
     def family(self, names: Sequence[str], mark: str = "") -> tuple[str, ...]:
         """Return the file's names of a family of columns (plain, or with a suffix); () if all are absent.
 
-        Where the options map some of them, the others are those that the file has under one of these names.
+        Where the options map only some columns of the family, the others are looked up under the plain or a suffixed
+        name.
 
         Raises:
-            MeasurementError: where one is missing, or the file has them under several of these names.
+            MeasurementError: if a column of the family is missing, or the file has the family under several suffixes.
         """
         marked = [name + mark for name in names]
         if any(name in self.options.columns for name in marked):
@@ -182,7 +186,7 @@ class Sheet:
         return families[0] if families else ()
 
     def _mapped(self, name: str, together: Sequence[str]) -> str:
-        """Return the file's name of column `name` of the family `together`, mapped only in part by the options."""
+        """Return the file's name of column `name` of the family `together`, of which the options map only a part."""
         if name in self.options.columns:
             return self.options.columns[name]
         candidates = [name + suffix for suffix in self.suffixes if name + suffix in self.table]
@@ -197,7 +201,7 @@ class Sheet:
 
 @dataclass(frozen=True)
 class Layout:
-    """Names of a file's columns that are read, by what they contain.
+    """Names of the file's columns that are read, by the quantity that they contain.
 
     Attributes:
         kind: one of `KINDS`.
@@ -206,12 +210,12 @@ class Layout:
         sigmas: the three sigmas of each target; () where not stated.
         orientation: four names (quaternion), nine (matrix), three (angles, whose meaning the options state), or none.
         sigma_rotation: three names or none.
-        distance: its name, and that of its sigma where there is one.
-        tool: one name or "".
+        distance: name of the distance column and, where present, of its sigma; () without a distance.
+        tool: name of the column of tool labels, or "".
         group: the columns whose labels together name a row's group.
         base: position and quaternion of a frame on the robot's base, seven names, or none.
         late: the target's velocity and the time, four names, or none.
-        notes: what a user should know of the choice.
+        notes: remarks for the user on how the columns were chosen.
     """
 
     kind: str
@@ -238,8 +242,8 @@ def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
     """Return which columns of a table are read, for a robot with these joints.
 
     Raises:
-        MeasurementError: where a column is missing or mapped in vain, or the header allows several kinds, or several
-            triples, and the options name none.
+        MeasurementError: if a column is missing or mapped to an unknown one, or if the header allows several kinds or
+            position triples and the options select none.
     """
     sheet.check_names(joints)
     layout = _layout(sheet, joints)
@@ -293,7 +297,7 @@ def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
 def _check_one_source(sheet: Sheet, position: Sequence[str], orientation: Sequence[str]) -> None:
     """Refuse a plain position with a measured orientation, or the reverse: the plain columns may be commands.
 
-    Measured is what is named so, or what the options map though the file has the plain names, too.
+    Columns count as measured if their name says so, or if the options map them although the file has plain names, too.
     """
     rotation_names = {4: QUATERNION.names, 9: MATRIX.names}.get(len(orientation))
     if rotation_names is None:
@@ -349,7 +353,7 @@ def _find_orientation(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
 def _angles(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
     """Return the names of three angle columns (in any case) that are not joints; () if absent.
 
-    Columns named by one small letter (a, b, c) are anything, unless the options state what angles mean.
+    Columns named by one small letter (a, b, c) count as angles only if the options state the meaning of the angles.
     """
     standard_names = ANGLES[0]
     if any(name in sheet.options.columns for name in standard_names):

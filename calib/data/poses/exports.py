@@ -62,7 +62,7 @@ class InstrumentExport(io.StringIO):
 
 @dataclass(frozen=True)
 class Grid:
-    """Where a text's numbers are: separator, decimal mark, index of the first line, its cells, and the rows above."""
+    """Location of the numbers in a text: separator, decimal mark, index and cells of the first line, rows above."""
 
     separator: str
     mark: str
@@ -83,7 +83,7 @@ def presets() -> dict[str, dict[str, str]]:
 
 
 def translated(path: str | Path) -> InstrumentExport | None:
-    """Return the file at `path` as a table of the toolkit; None where it is one already, or no table of positions."""
+    """Return the file at `path` as a table of the toolkit; None if it is one already, or has no positions."""
     with open(path, "rb") as file:
         beginning = file.read(HEAD)
         is_utf16 = beginning[:2] in (b"\xff\xfe", b"\xfe\xff")
@@ -127,7 +127,7 @@ def translated(path: str | Path) -> InstrumentExport | None:
 
 
 def _preset(lines: Sequence[str]) -> dict[str, str]:
-    """Return the known export that begins with these lines; {} where it is none."""
+    """Return the known export whose files begin with these lines; {} if there is none."""
     first_line = ""
     for line in lines:
         if line.strip():
@@ -161,7 +161,7 @@ def _length_unit(preset: dict[str, str], head: str, preamble: Sequence[str]) -> 
 
 
 def _grid(lines: Sequence[str]) -> Grid | None:
-    """Return where the numbers of a text begin, with the separator that makes most cells of a line numbers."""
+    """Return the location of a text's numbers, with the separator that makes most cells of a line numbers; or None."""
     content = [(i, line) for i, line in enumerate(lines) if _is_content(line)]
     best, best_count = None, MIN_NUMBERS - 1
     for separator in "\t;|, ":
@@ -182,7 +182,7 @@ def _grid(lines: Sequence[str]) -> Grid | None:
 
 
 def _first_of_numbers(rows: Sequence[Sequence[str]], counts: Sequence[int]) -> int | None:
-    """Return the index of the first of several rows of equal length with enough numbers; None without any."""
+    """Return the index of the first of several rows of equal length with enough numbers; None if there is none."""
     for k, row in enumerate(rows):
         if counts[k] < MIN_NUMBER_SHARE * len(row):
             continue
@@ -221,7 +221,7 @@ def _rows(lines: Sequence[str], grid: Grid) -> Iterator[list[str]]:
 
 
 def _columns(grid: Grid) -> tuple[list[str], list[str], bool]:
-    """Return our name ("": left out) and unit of each column, and whether one differs from what the file says."""
+    """Return the toolkit's name ("": left out) and the unit of each column, and whether any differs from the file's."""
     above, width = list(grid.above), len(grid.cells)
     units = [""] * width
     if above and any(above[-1]) and all(cell.lower() in UNITS for cell in above[-1] if cell):
@@ -251,7 +251,7 @@ def _is_ours(names: Sequence[str]) -> bool:
 
 
 def _unnamed(grid: Grid) -> tuple[list[str], list[str]]:
-    """Return names and units of columns that no row names: texts first, then x, y, z; none where no text is first."""
+    """Return names and units for columns without names: texts, then x, y, z; empty if the first cell is no text."""
     numeric = grid.numeric
     texts = numeric.index(True)
     if not 0 < texts <= 3 or not all(numeric[texts : texts + 3]):

@@ -1,7 +1,7 @@
 """Measurements at poses: one frozen type per kind of measurement, independent of the robot.
 
-A kind says something of the tool point p (and frame R) that the robot carries. What it says of the geometry is a
-residual function registered for the type in `calib.geometry.residuals`.
+Each kind is a measurement of the tool point p (and frame R) that the robot carries. Its residual function is registered
+for the type in `calib.geometry.residuals`.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ class PoseMeasurements:
         joint_names: as in the file's header.
         tool: (m,) index into ``tool_names``: which reflector or target of the tool was seen.
         station: name of the instrument placement that these rows share (unused by kinds without an instrument).
-        file, rows: where they came from; rows (m,) count data rows from 1.
+        file, rows: path of the file, and number (m,) of each row in it, data rows counted from 1.
         torque: (m, n) gravity torques of the arm at these rows [N m], for compliance terms; None if not known.
-        ignored: header names that were not used, for the message.
-        notes: findings on odd values that were accepted, for the message.
+        ignored: names of columns that were not read, for messages.
+        notes: remarks on unusual values that were accepted, for messages.
 
-    Of a kind:
-        kind: its name in files.
-        has_instrument: whether rows are seen from a station whose placement matters.
-        placing: rank among kinds in how well they place instrument and target, the best ones 0.
+    Class attributes of each kind:
+        kind: name of the kind in files.
+        has_instrument: whether rows are measured from a station whose placement has to be fitted.
+        placing: rank of the kind in how well it determines the placements of instrument and target, 0 being the best.
     """
 
     q: np.ndarray
@@ -55,9 +55,9 @@ class PoseMeasurements:
 
     @property
     def measures_length(self) -> bool:
-        """Whether the rows hold measured lengths, without which a smaller arm explains them as well.
+        """Whether the rows contain measured lengths, which determine the scale of the arm.
 
-        Not so sockets: distances between a few of them are short beside the arm, and noise draws its scale off them.
+        False for sockets: known distances between them are short compared with the arm, and noise would bias its scale.
         """
         return self.has_instrument
 
@@ -87,13 +87,13 @@ class PoseMeasurements:
 
         Args:
             q: (m, n) joint values [rad or m].
-            position: (m, 3) of the target in the instrument's frame [m].
-            quaternion: (m, 4) x y z w of unit norm.
+            position: (m, 3) positions of the target in the instrument's frame [m].
+            quaternion: (m, 4) orientations x y z w, of unit norm; None for positions only.
             joint_names: n names; q1 to qn by default.
             fields: other fields of `Positions` and `Poses`: ``sigma``, ``station``, ``tool_names`` ...
 
         Raises:
-            MeasurementError: for arrays of other lengths than q.
+            MeasurementError: for arrays whose length differs from that of q.
         """
         values = np.atleast_2d(np.asarray(q, dtype=float))
         names = tuple(joint_names) or tuple(f"q{j + 1}" for j in range(values.shape[1]))
@@ -111,17 +111,17 @@ class PoseMeasurements:
 
     @property
     def together(self) -> np.ndarray:
-        """(m,) number of the robot pose (or pair of poses) of each row; rows of one number are kept together."""
+        """Number (m,) of the robot pose (or pair of poses) of each row; folds keep rows of equal number together."""
         return self.rows
 
     @property
     def measured(self) -> np.ndarray:
-        """(m, k) measured numbers of each row, by which repeated rows are recognised."""
+        """Measured numbers (m, k) of each row, by which repeated rows are recognised."""
         return np.zeros((len(self), 0))
 
     @property
     def carried(self) -> tuple[str, object]:
-        """Object on the flange: ``tool``, or the instrument or its target with a key that distinguishes it."""
+        """Object on the flange, as a pair: ``tool``, the instrument or its target, and a key that distinguishes it."""
         return "tool", None
 
     @property
@@ -140,8 +140,8 @@ class Positions(PoseMeasurements):
     Attributes:
         position: (m, 3) [m].
         sigma: (m, 3) standard deviation of the position [m]; None where not stated.
-        late: (m, k, 3) how positions change by k errors of unknown size that all rows share, as those of a clock (its
-            offset [m/s] and drift [m]); None without any.
+        late: (m, k, 3) derivatives of the positions by k unknown errors that all rows share, such as a clock's offset
+            [m/s] and drift [m]; None without such errors.
     """
 
     position: np.ndarray
@@ -188,8 +188,8 @@ class GroupedMeasurements(PoseMeasurements):
 
     Attributes:
         group: (m,) index of the socket, plane, pair or bar centre.
-        group_names: one per group.
-        sigma: standard deviation [m], of a shape that the kind says; None where not stated.
+        group_names: names of the groups.
+        sigma: standard deviation [m], with the shape stated at each kind; None where not stated.
     """
 
     _: KW_ONLY

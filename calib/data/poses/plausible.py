@@ -20,7 +20,7 @@ def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joi
     """Check joint values (m, n) [rad or m] of a robot's joints, in the file's `columns`.
 
     Returns:
-        Notes on what is odd but possible.
+        Notes on unusual but possible values.
 
     Raises:
         MeasurementError: for degrees under a rad header, values outside the limits, a robot that never moved.
@@ -84,7 +84,7 @@ def _check_joint_units(sheet: Sheet, columns: Sequence[str], kinds: Sequence[str
 
 
 def check_block(block: PoseMeasurements, options: FileOptions, robot: Joints) -> PoseMeasurements:
-    """Return measurements in memory with the notes of the checks; refuse them where a file would be refused."""
+    """Return measurements given in memory, with notes, after the checks that a file undergoes."""
     q, joints = np.asarray(block.q), tuple(block.joint_names)
     where = block.file or "measurements in memory"
     message = f"q has shape {q.shape}, expected (rows, joints) with {len(joints)} joints"

@@ -69,7 +69,7 @@ from calib.records import FieldValues
 
 
 def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasurements:
-    """Return grouped measurements from the rows of a table, with joint values q (m, n)."""
+    """Return grouped measurements from the rows of a table, with joint values q (m, n) [rad or m]."""
     table, options = sheet.table, sheet.options
     names, group = labels(table, layout.group)
     tool_names, tool = (options.tool,), np.zeros(len(q), dtype=int)
@@ -182,12 +182,12 @@ def relative_to_base(block: Positions, position: np.ndarray, quaternion: np.ndar
         p = R_bᵀ (p_t - p_b),   R = R_bᵀ R_t
         Σ_p = R_bᵀ (Σ_t + Σ_b + [l]× Σ_rb [l]×ᵀ) R_b,  l = p_t - p_b;   Σ_r = R_bᵀ (Σ_rt + Σ_rb) R_b
 
-    The base is taken to be measured as well as the target: the same sigmas. Of the covariances the diagonals are kept.
+    The base is assumed to be measured with the target's sigmas. Only the diagonals of the covariances are kept.
 
     Args:
         block: positions or poses, in the instrument's frame.
-        position: (m, 3) of the base frame [m].
-        quaternion: (m, 4) of the base frame, x y z w, unit norm.
+        position: (m, 3) positions of the base frame [m].
+        quaternion: (m, 4) orientations of the base frame, x y z w, of unit norm.
     """
     base = Rotation.from_quat(quaternion)
     lever = block.position - position
@@ -228,14 +228,14 @@ def read_measurements(
     """Return the measurements in a file, or in a table read from one, for a robot with these joints.
 
     Args:
-        joints: the robot's n joints, or their names (of revolute joints without limits).
-        options: names, units, kind where the header does not state it.
+        joints: the robot's n joints, or their names alone (then taken as revolute without limits).
+        options: column names, units and kind where the header does not state them.
 
     Returns:
-        One block.
+        A list of one block.
 
     Raises:
-        MeasurementError: for whatever cannot be what it claims to be, with row and column.
+        MeasurementError: for an invalid file or value, with row and column.
     """
     robot = Joints.of(joints)
     options = options or FileOptions()
@@ -278,7 +278,7 @@ def read_measurements(
 def joint_columns(path: str | Path) -> tuple[str, ...]:
     """Return the header names of `path` that may be joints (without ``q_``): all names unknown to the toolkit.
 
-    A caller compares them with the chains of a URDF, to find the chain that was measured.
+    Callers compare them with the chains of a URDF, to find the chain that was measured.
     """
     toolkit_names = {name + suffix for name in OURS for suffix in SUFFIXES}
     names, units = read_header(path)
@@ -374,7 +374,7 @@ def _sigma(sheet: Sheet, layout: Layout, visible: np.ndarray) -> np.ndarray | No
 
 
 def _late(sheet: Sheet, layout: Layout, index: np.ndarray) -> np.ndarray | None:
-    """Return how the positions of rows change with a clock's offset and drift (m, 2, 3); None where not stated."""
+    """Return the derivatives (m, 2, 3) of positions by a clock's offset and drift [m/s, m]; None if not stated."""
     if not layout.late:
         return None
     velocity = sheet.numbers(layout.late[:3], LATE)[index]

@@ -134,11 +134,11 @@ def check_against(
     A planned and a measured pose are the same if no joint differs by more than `max_difference`.
 
     Returns:
-        Notes: rows that nobody planned.
+        Notes on measured rows that were not planned.
 
     Raises:
-        MeasurementError: where most rows were not planned, with the cause if degrees, swapped or reversed joint
-            columns explain it.
+        MeasurementError: if most rows were not planned; the message names the cause if degrees, or swapped or reversed
+            joint columns, explain it.
     """
     plan = shaped(plan, (None, measured.q.shape[1]), "plan")
     q, rows = _distinct(measured)
@@ -154,7 +154,7 @@ def check_against(
 def unmeasured(
     plan: ArrayLike, measured: Sequence[PoseMeasurements], max_difference: float = MAX_JOINT_DIFFERENCE
 ) -> tuple[str, ...]:
-    """Return a note on the planned poses (m, n) [rad or m] that are in none of the blocks; empty if all are."""
+    """Return a note on the planned poses (m, n) [rad or m] that are in none of the blocks; () if all were measured."""
     if not measured:
         return ()
     plan = np.asarray(plan)
@@ -167,7 +167,7 @@ def unmeasured(
 
 
 def _distinct(measured: PoseMeasurements) -> tuple[np.ndarray, np.ndarray]:
-    """Return joint values and file row numbers, one per row of the file (several targets share a row)."""
+    """Return joint values and row numbers, each row of the file once (several targets may share a row)."""
     rows, first = np.unique(measured.rows if measured.rows is not None else [], return_index=True)
     return measured.q[first], rows
 
@@ -235,13 +235,13 @@ class Targets:
 
     Attributes:
         q: (m, n) nominal joint values [rad or m]; None where the file has none.
-        position: (m, 3) [m]; None where joints say it all.
-        rotation: (m, 3, 3); None without an orientation.
+        position: (m, 3) desired tool positions [m]; None where joint values define the targets.
+        rotation: (m, 3, 3) desired tool orientations; None without orientation.
         columns: the file's names of the joint columns with their units in brackets; () without joints.
         factors: (n,) SI value of one unit of each joint column.
-        ignored: columns that were not read.
-        notes: what is odd but was accepted.
-        file: where it came from.
+        ignored: names of columns that were not read.
+        notes: remarks on unusual values that were accepted.
+        file: path of the file.
     """
 
     q: np.ndarray | None
@@ -280,7 +280,7 @@ def read_targets(path: str | Path, joints: Joints | Sequence[str]) -> Targets:
             do holds something else.
 
     Raises:
-        MeasurementError: for whatever cannot be what it claims to be, with row and column.
+        MeasurementError: for an invalid file or value, with row and column.
     """
     sheet = Sheet(read_table(path), suffixes=SUFFIXES)
     robot = Joints.of(joints)

@@ -45,7 +45,7 @@ CHUNK = 1 << 16
 
 
 def read_archive(path: Path, joints: Joints | None, options: RecordingOptions, ends: Ends = (None, None)) -> Recording:
-    """Return the recording in a NumPy archive (.npz) from ends[0] to ends[1] [s]; only shapes are checked."""
+    """Return the recording in a NumPy archive (.npz) from ends[0] to ends[1] [s]; values are not checked."""
     with _opened(path) as archive:
         return _recording(archive, joints, options, ends)
 
@@ -87,15 +87,15 @@ class _Archive:
 
     @cached_property
     def members(self) -> dict[str, str]:
-        """Member → its name in the file."""
+        """Map from each member's name to its file name in the archive."""
         return {name.removesuffix(".npy"): name for name in self.file.namelist()}
 
     def fail(self, message: str, name: str | None = None) -> NoReturn:
-        """Refuse the archive, or one of its members."""
+        """Raise MeasurementError about the archive, or about one of its members."""
         refuse_data(self.path, message, name)
 
     def header(self, name: str) -> tuple[IO[bytes], tuple[int, ...], bool, np.dtype]:
-        """Return a member's stream after its header, its shape, whether its order is Fortran's, and its type."""
+        """Return a member's stream after its header, its shape, whether it is stored in Fortran order, and its type."""
         member = self.members[name]
         stream = self.file.open(member)
         # What numpy's reader of headers raises, and Python's parser in it.
@@ -114,10 +114,10 @@ class _Archive:
         return stream, shape, fortran, dtype
 
     def read(self, name: str, rows: np.ndarray | None = None, exact: bool = False, kinds: str = "fiub") -> np.ndarray:
-        """Return a member as floats (`exact`: in its stored type), all or the `rows` (numbers, rising).
+        """Return a member as floats (`exact`: in its stored type): all rows, or those numbered in `rows` (rising).
 
         Args:
-            kinds: accepted kinds of numpy's types.
+            kinds: accepted kinds of numpy types, as letters of ``dtype.kind``.
         """
         stream, shape, fortran, dtype = self.header(name)
         with stream:
@@ -219,7 +219,7 @@ def _variance(archive: _Archive, name: str, shape: tuple[int, ...], rows: np.nda
 
 
 def _stamps(archive: _Archive, names: Mapping[str, str], options: RecordingOptions, count: int) -> np.ndarray:
-    """Return the time (N,) [s] of all samples since the first, from stamps or from a stated rate."""
+    """Return the times (N,) [s] of all samples since the first sample, from stamps or a stated rate."""
     if "t" not in names:
         rate = options.rate or _rate(archive)
         if not rate > 0:
@@ -244,7 +244,7 @@ def _rate(archive: _Archive) -> float:
 
 
 def _used(archive: _Archive, t: np.ndarray, options: RecordingOptions, ends: Ends) -> tuple[np.ndarray, list[str]]:
-    """Return the rows to read (of the cut, else of the file's use_range, else of all), and notes."""
+    """Return the rows to read (those of the cut, else of the file's use_range, else all), and notes."""
     use_range = None
     if options.use_range and ends == (None, None):
         use_range = archive.few("use_range", 2)
@@ -272,7 +272,7 @@ def _joint_names(archive: _Archive) -> list[str]:
 
 
 def _arrange(values: np.ndarray, order: list[int], factor: float) -> np.ndarray:
-    """Return the columns in `order`, in SI; copied only if they change."""
+    """Return the columns in `order`, in SI; copied only if order or unit changes."""
     if order != list(range(values.shape[1])):
         values = values[:, order]
     if factor != 1.0:

@@ -33,7 +33,7 @@ FRANKA_STATE = "franka_msgs/msg/FrankaRobotState"  # of franka_ros2: a joint sta
 
 
 def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Recording:
-    """Return the recording of a bag's joint states; only shapes are checked."""
+    """Return the recording of a bag's joint states; values are not checked, only shapes."""
     with opened(path) as reader:
         connections = connections_of(
             reader, (*JOINT_STATE, FRANKA_STATE), options.topic, path, "joint states", "topic = '...'", "/joint_states"
@@ -79,10 +79,10 @@ def connections_of(
 
     Args:
         topic: the requested topic; if empty, the only topic found, or the `usual` one.
-        what, option: contents of such topics and the option that selects one, for messages.
+        what, option: words for the topics' content and name of the option that selects a topic, for messages.
 
     Raises:
-        MeasurementError: without such a topic, or with several of which none is asked for.
+        MeasurementError: if there is no such topic, or there are several and none is requested.
     """
     connections = [connection for connection in reader.connections if connection.msgtype in kinds]
     topics = sorted({connection.topic for connection in connections})
@@ -137,7 +137,7 @@ def header_stamp(message: Any) -> int:
 
 
 def _stack(values: list[object], series: str, path: Path) -> np.ndarray:
-    """Return the rows as one array; an empty array if no message has the quantity."""
+    """Return the rows as one array; an empty array if no message contains this quantity."""
     missing = [k for k, value in enumerate(values) if value is None]
     if len(missing) == len(values):
         return np.empty((0, 0))

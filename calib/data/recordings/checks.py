@@ -60,8 +60,8 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
     """Return the recording with notes on odd values; refuse impossible ones.
 
     Raises:
-        MeasurementError: for too few samples, values that are not finite, time that stands or runs backwards, degrees
-            for radians, a torque that is one number while its joint moves.
+        MeasurementError: for too few samples, values that are not finite, stamps that do not increase, degrees in place
+            of radians, or a torque that is constant while its joint moves.
     """
     few = f"{len(recording)} samples are too few for filters; at least {LIMITS.min_samples} are needed"
     require(len(recording) >= LIMITS.min_samples, few, MeasurementError, recording.file)
@@ -81,10 +81,11 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
 
 
 def _without_absent(recording: Recording) -> Recording:
-    """Return the recording without velocities that are NaN in every row: drivers state so what they do not provide.
+    """Return the recording without velocities that are NaN in every row: drivers write NaN for what they do not
+    provide.
 
     Raises:
-        MeasurementError: where positions or torques of a joint are NaN in every row.
+        MeasurementError: if positions or torques of a joint are NaN in every row.
     """
     absent = {}
     for name in NEEDED[1:]:
@@ -109,7 +110,9 @@ def _without_absent(recording: Recording) -> Recording:
 
 
 def _check_finite(recording: Recording, limit: float = np.inf) -> None:
-    """Refuse NaN, infinities and values beyond `most`; NaN in `q_link` means: no second encoder."""
+    """Refuse NaN, infinities and values beyond `limit`; NaN is allowed in `q_link`, for joints without a second
+    encoder.
+    """
     series = []
     columns: list[str] = []
     for name in NEEDED:
@@ -127,8 +130,8 @@ def _check_finite(recording: Recording, limit: float = np.inf) -> None:
 def _sound_part(recording: Recording, bad: np.ndarray) -> str:
     """Return words on the cut to the longest part of rising stamps without a row marked in `bad` (N,) or (N, k).
 
-    A cut goes by the latest stamp up to each row. "" where that part is too short, and where pieces were read: what
-    lies between them is not known.
+    A cut refers to the latest stamp up to each row. "" where that part is too short, or where the file was read in
+    pieces, since the rows in between are unknown.
     """
     if np.ptp(recording.rows) + 1 > len(recording):
         return ""
@@ -144,11 +147,11 @@ def _sound_part(recording: Recording, bad: np.ndarray) -> str:
 def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
     """Return the recording without the few rows that have impossible torques (spikes of the log).
 
-    Such a torque is beyond `max_effort` times the limit and `min_spike_beyond` times what all but `max_spike_share` of
-    the rows stay below, or `min_spike` times that.
+    A spike exceeds `max_effort` times the joint's limit and `min_spike_beyond` times the bound below which all but
+    `max_spike_share` of the rows stay; or, whatever the limit, `min_spike` times that bound.
 
     Raises:
-        MeasurementError: where more rows than that, up to `max_unit_share`, are beyond the limit by as much.
+        MeasurementError: if more rows, up to `max_unit_share`, exceed the limit by as much.
     """
     count = len(recording)
     max_count = max(LIMITS.max_spikes, int(LIMITS.max_spike_share * count))
@@ -262,7 +265,7 @@ def _check_size(recording: Recording, joints: Joints | None = None) -> None:
 
 
 def _likely_unit(recording: Recording, joint: int, unit: str) -> str:
-    """Return advice on positions of a joint [rad or m] beyond its travel, that may be in the unit `other`."""
+    """Return advice on positions of a joint [rad or m] beyond its travel, that may be in another unit."""
     if unit == "deg" and np.abs(recording.q[:, joint]).max() > LIMITS.max_degrees:
         return (
             "too large for deg, too: encoder counts? Convert them to rad or deg, zero and counts per turn allowed for"
@@ -344,7 +347,7 @@ def _effort_notes(recording: Recording, joints: Joints | None) -> list[str]:
     """Return notes on torques that do not suit the effort limits (currents, or torques before the gear).
 
     Raises:
-        MeasurementError: where every joint is far beyond its limit: another unit.
+        MeasurementError: if every joint is far beyond its limit, so that the torques are in another unit.
     """
     peak, limit = np.abs(recording.effort).max(axis=0), _effort_limits(recording, joints)
     is_limited = np.isfinite(limit)
@@ -386,7 +389,7 @@ def _limit_notes(recording: Recording, joints: Joints | None) -> list[str]:
 def _work_notes(recording: Recording) -> list[str]:
     """Return a note if torques take energy out of the robot: over a closed path friction requires ∫τᵀ dq > 0.
 
-    Between different poses gravity pays too, an arm that comes down gives energy back: there nothing is said.
+    No note where the motion does not return to a pose: between different poses gravity does work, too.
     """
     rows = _round_trip(recording.q) if recording.kind == "torque" else None
     if rows is None:
@@ -400,7 +403,9 @@ def _work_notes(recording: Recording) -> list[str]:
 
 
 def _round_trip(q: np.ndarray) -> slice | None:
-    """Return the steps between two distant rows of nearly equal poses; None if the motion does not return."""
+    """Return the time steps between two rows, far apart in time, of nearly equal poses; None if the motion does not
+    return.
+    """
     step = max(1, len(q) // LIMITS.max_compared)
     poses = q[::step] / np.maximum(np.ptp(q, axis=0), LIMITS.min_travel)
     distance = np.abs(poses[:, None] - poses[None]).max(axis=2)

@@ -27,15 +27,15 @@ ABOUT = 3.0  # factor between that step and the motion expected meanwhile
 
 @dataclass(frozen=True)
 class ColumnFault:
-    """A column of one joint that stands.
+    """A column of one joint that is constant while what it measures changes.
 
     Attributes:
-        kind: ``clipped`` torque, ``position`` or ``velocity`` that stands.
+        kind: ``clipped`` (torque), or ``position`` or ``velocity`` (constant column).
         joint: index of the joint.
-        share: of the rows in motion that a torque is clipped in, or of all rows that a column stands in.
+        share: share of the moving rows in which a torque is clipped, or of all rows in which a column is constant.
         values: the extremes at which a torque is clipped [N m or N; A].
-        start, stop: when the longest standing part begins and ends [s].
-        missed: motion that it does not show [rad or m].
+        start, stop: times at which the longest constant part begins and ends [s].
+        missed: motion that the column does not show [rad or m].
     """
 
     kind: str
@@ -50,10 +50,10 @@ class ColumnFault:
 def column_faults(
     t: np.ndarray, q: np.ndarray, effort: np.ndarray, v: np.ndarray | None = None
 ) -> tuple[ColumnFault, ...]:
-    """Return the columns that stand of a recording as logged.
+    """Return the columns of a recording that are constant while what they measure changes; () if there are none.
 
     Args:
-        t: (N,) [s].
+        t: (N,) stamps as logged [s].
         q: (N, n) positions [rad or m].
         effort: (N, n) torques or currents.
         v: (N, n) measured velocities; None where not recorded.
@@ -71,7 +71,9 @@ def column_faults(
 
 
 def _clipped(joint: int, t: np.ndarray, q: np.ndarray, torque: np.ndarray) -> ColumnFault | None:
-    """Return a torque that repeats its extreme value exactly while its joint moves at various speeds."""
+    """Return the fault of a torque that repeats its extreme value exactly while its joint moves at various speeds; or
+    None.
+    """
     speed = np.abs(_speed(t, q))
     peak = float(speed.max())
     moves = speed > MOVING * peak
@@ -96,7 +98,7 @@ def _clipped(joint: int, t: np.ndarray, q: np.ndarray, torque: np.ndarray) -> Co
 
 
 def _standing_position(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> ColumnFault | None:
-    """Return a position that stands while the measured velocity changes and adds up to a motion."""
+    """Return the fault of a position that is constant while the measured velocity integrates to a motion; or None."""
     min_travel = max(MIN_TRAVEL, MIN_STEPS * _resolution(q))
     parts = []
     for first, last in _constant(q):
@@ -109,7 +111,7 @@ def _standing_position(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) 
 
 
 def _standing_velocity(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> ColumnFault | None:
-    """Return a velocity that stands while the position moves otherwise."""
+    """Return the fault of a velocity that is constant while the position moves at another speed; or None."""
     parts = []
     for first, last in _constant(v):
         time = t[first:last] - t[first]
@@ -121,7 +123,7 @@ def _standing_velocity(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) 
 
 
 def _jumping(joint: int, t: np.ndarray, q: np.ndarray) -> ColumnFault | None:
-    """Return a position that stands at once while it moves, then jumps by about what it would have moved."""
+    """Return the fault of a position that freezes during motion, then jumps by about the motion missed; or None."""
     parts = []
     for first, last in _constant(q):
         if first < REACH or last + REACH >= len(q):
@@ -139,7 +141,7 @@ def _jumping(joint: int, t: np.ndarray, q: np.ndarray) -> ColumnFault | None:
 
 
 def _of_parts(kind: str, joint: int, t: np.ndarray, parts: list[tuple[int, int, float]]) -> ColumnFault | None:
-    """Return the fault of standing parts (first row, row behind the last, motion missed); None without any."""
+    """Return the fault with these constant parts (first row, row behind the last, motion missed); None for no parts."""
     if not parts:
         return None
     rows = sum(last - first for first, last, _ in parts)
@@ -156,7 +158,7 @@ def _constant(values: np.ndarray) -> Iterator[tuple[int, int]]:
 
 
 def _resolution(values: np.ndarray) -> float:
-    """Return the smallest step between values (N,), numbers that differ by rounding alone left aside; 0 without any."""
+    """Return the smallest step between values (N,), steps by rounding alone ignored; 0 if all values are equal."""
     steps = np.diff(np.unique(values))
     steps = steps[steps > 1e-9 * np.abs(values).max(initial=0.0)]
     return float(steps.min(initial=np.inf)) if len(steps) else 0.0
@@ -172,7 +174,7 @@ def _moved(t: np.ndarray, v: np.ndarray) -> float:
 
 
 def _wander(t: np.ndarray, v: np.ndarray) -> float:
-    """Return how far white noise of velocities (N,) may add up to [rad or m]."""
+    """Return the largest plausible drift [rad or m] of the integral of the white noise in velocities (N,)."""
     noise = float(np.std(np.diff(v))) / np.sqrt(2.0)
     return MAX_WANDER * noise * float(np.median(np.diff(t))) * float(np.sqrt(len(t)))
 

@@ -43,7 +43,7 @@ def logs() -> dict[str, ParsedTable]:
 
 
 def translated(path: str | Path) -> Log | None:
-    """Return the log at `path` as a table of the toolkit; None where it is none of the known ones."""
+    """Return the log at `path` as a table of the toolkit; None where it is no known log."""
     with open(path, encoding="utf-8-sig", errors="replace") as file:
         head = file.readline(LONGEST)
         form = _form(head)
@@ -71,7 +71,7 @@ def translated(path: str | Path) -> Log | None:
 
 
 def _form(head: str) -> ParsedTable | None:
-    """Return the known log with this first line; None where it is none."""
+    """Return the known log whose files have this first line; None if there is none."""
     for form in logs().values():
         if re.search(form["header"], head):
             return form
@@ -96,7 +96,7 @@ def _is_whole(body: str, separator: str | None, column: int) -> bool:
 
 
 def _with_time(body: str, columns: Sequence[int]) -> str:
-    """Return rows parted by blanks with their time since the first [s] in front, from seconds and nanoseconds."""
+    """Return blank-separated rows with their time since the first row [s] prepended, from seconds and nanoseconds."""
     result: list[str] = []
     first_second = 0.0
     for line in body.splitlines():

@@ -48,10 +48,10 @@ class Recording:
             as torques; None where not recorded.
         drive_gain: (n,) torque per current that the file states [N·m/A or N/A]; None where it states none.
         effort_variance: (n,) mean variance of the effort's samples, from repeats [its unit²]; None where not known.
-        file: where it came from.
+        file: path of the file.
         rows: (N,) number of each sample in the file, counted from 1.
-        notes: odd but accepted findings, for the message; jumps: descriptions of position jumps; faults: columns that
-            stand while what they measure moves.
+        notes: remarks on unusual values that were accepted, for messages; jumps: descriptions of position jumps;
+            faults: columns that are constant while what they measure changes.
     """
 
     t: np.ndarray
@@ -134,7 +134,7 @@ class Recording:
         """Return the recording of the samples with start ≤ t < stop [s]; None: no bound at that end.
 
         Raises:
-            MeasurementError: where nothing is left.
+            MeasurementError: if no sample is in the interval.
         """
         return self.take(rows_of_cut(self.t, start, stop, self.file))
 
@@ -150,9 +150,9 @@ class Recording:
 def rows_in_pieces(t: np.ndarray, first: int, stop: int, max_samples: int | None) -> tuple[np.ndarray, list[str]]:
     """Return the rows to use of a recording's rows `first` to `stop`, and notes: all, or `max_samples` in pieces.
 
-    A piece lies at a random place in each of `PIECES` equal parts: the whole time takes part, and no period of the
-    motion meets the same phase each time. Up to a quarter more rows are used whole; so are all rows where the stamps
-    t (N,) of pieces run backwards, which is refused later: only the whole tells where to cut.
+    One piece is taken at a random position in each of `PIECES` equal parts, so that pieces cover the whole time and do
+    not lock to a period of the motion. All rows are used if they exceed `max_samples` by a quarter at most, or if
+    stamps t (N,) run backwards, which a later check refuses with advice on where to cut.
     """
     count = stop - first
     if max_samples is None or count <= MAX_EXCESS * max_samples:
@@ -172,7 +172,9 @@ def rows_in_pieces(t: np.ndarray, first: int, stop: int, max_samples: int | None
 
 
 def rows_used(t: np.ndarray, ends: Ends, max_samples: int | None, file: str | Path) -> tuple[np.ndarray, list[str]]:
-    """Return the rows of a file with stamps `t` (N,) [s] that a cut leaves, `max_samples` in pieces, and notes."""
+    """Return the rows of a file with stamps `t` (N,) [s] that are within a cut, at most `max_samples` of them in
+    pieces, and notes.
+    """
     cut = slice(0, len(t))
     if ends != (None, None):
         # Time that runs back is refused later.
@@ -204,7 +206,7 @@ def earlier(recording: Recording, lag: float) -> Recording:
     Samples without a recorded torque are removed.
 
     Raises:
-        MeasurementError: where nothing is left.
+        MeasurementError: if no sample is left.
     """
     if not lag:
         return recording
@@ -246,7 +248,7 @@ def parse_cut(text: str) -> tuple[str, float | None, float | None]:
     Seconds count from the file's first sample. Without an ``@`` the whole text is the file.
 
     Raises:
-        UsageError: for a cut that is not two times, or is empty.
+        UsageError: if the cut is not two times, or contains no time.
     """
     match = _CUT.match(text)
     if match is None:
@@ -265,7 +267,7 @@ def parse_cut(text: str) -> tuple[str, float | None, float | None]:
 
 
 def named(names: Sequence[str], n: int) -> tuple[str, ...]:
-    """Return `names`, or q1 … qn if empty."""
+    """Return `names`, or q1 … qn if `names` is empty."""
     if len(names):
         return tuple(names)
     return tuple(f"q{j + 1}" for j in range(n))

@@ -35,7 +35,7 @@ from calib.records import FieldValues
 
 
 def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends: Ends = (None, None)) -> Recording:
-    """Return the recording in a CSV table from ends[0] to ends[1] [s]; only shapes are checked; about 20 MB/s."""
+    """Return the recording in a CSV table from ends[0] to ends[1] [s]; values are not checked; about 20 MB/s."""
     table = _numbered_brackets(read_table(path, doubles=True))
     columns_of = _find_columns(table, options, joints.names if joints else ())
     renamed = one_effort({name: name for name in columns_of}, options, table.header, path)
@@ -206,10 +206,10 @@ def read_recording(
     """Return the checked recording at `path`, which may be cut in time (``log.npz@0:9.4``).
 
     Args:
-        joints: the robot's; columns are put in their order if the file names its joints.
+        joints: the robot's joints; columns are put in their order if the file names its joints. None: as in the file.
 
     Raises:
-        MeasurementError: where the file cannot be what it should be; with row and column.
+        MeasurementError: for an invalid file or value, with row and column.
         UsageError: for an invalid cut.
     """
     file, start, stop = parse_cut(str(path))
@@ -231,7 +231,7 @@ def read_recording(
 
 
 def _described(recording: Recording, controller: str) -> Recording:
-    """Return a recording of the description's joints from one of joints as a controller shows them."""
+    """Return a recording converted from joint values as the controller shows them to those of the robot description."""
     if not controller:
         return recording
     series_of = {

@@ -144,7 +144,7 @@ class RecordingOptions:
             _known(self.units)
 
     def factor(self, name: str) -> float:
-        """Return the factor to SI of the unit stated for one of our names; 1 if none is stated."""
+        """Return the factor to SI of the unit stated for one of the toolkit's names; 1 if none is stated."""
         unit = self.units.get(name, "")
         return SCALES[name][unit.lower()] if unit else 1.0
 
@@ -171,7 +171,7 @@ def stem_of(name: str) -> tuple[str, int | None]:
 
 
 def plain_stems(stems: Sequence[str]) -> dict[str, str]:
-    """Return a map from each stem, and from its form without leading words of `MEASURED` if unique, to it."""
+    """Return a map to each stem from itself and, if unique, from its form without leading words of `MEASURED`."""
     short: dict[str, list[str]] = {}
     for stem in stems:
         parts = stem.split("_")
@@ -183,7 +183,7 @@ def plain_stems(stems: Sequence[str]) -> dict[str, str]:
 
 
 def find_names(members: tuple[str, ...], options: RecordingOptions, path: Path) -> dict[str, str]:
-    """Return the file's name of each series in it, by the toolkit's name."""
+    """Return a map from the toolkit's name of each series in the file to the file's name."""
     members_by_stem: dict[str, str] = {}
     for member in members:
         stem, number = stem_of(member)

@@ -1,8 +1,8 @@
-"""Rows whose stamps run backwards by a little: put in order. Those of two logs in one file, or of a set clock, are not.
+"""Rows whose stamps run backwards by a few steps are put in order; rows of two joined logs, or of a set clock, are not.
 
-Two things look alike: rows written in another order than they were sampled (several threads or sockets), and stamps of
-rows in the right order that jitter by more than a step. The positions tell: of two orders of the same samples, the
-right one is the shorter way through them.
+Rows written in another order than they were sampled (several threads or sockets) look like rows in the right order with
+stamps that jitter by more than a step. Positions distinguish the two: of two orders of the same samples, the right one
+gives the shorter path.
 """
 
 from dataclasses import replace
@@ -39,12 +39,12 @@ def in_order(recording: Recording) -> Recording:
 
 
 def goes_far_back(t: np.ndarray) -> np.ndarray:
-    """Return the mask (N,) of stamps (N,) that are earlier than the one before by more than can be put in order."""
+    """Return the mask (N,) of stamps (N,) that are earlier than the stamp before by more than `MAX_BACK` steps."""
     return np.append(False, np.diff(t) < -MAX_BACK * _usual_step(t))
 
 
 def _usual_step(t: np.ndarray) -> float:
-    """Return the median distance of neighbouring stamps (N,), whichever comes first."""
+    """Return the median distance of neighbouring stamps (N,), regardless of sign."""
     return float(np.median(np.abs(np.diff(t))))
 
 

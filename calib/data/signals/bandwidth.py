@@ -2,8 +2,9 @@
 
 Gautier's rules, with ω_dyn the highest frequency at which the rigid body moves: the positions' low-pass filter at
 ω_f ≥ 5 ω_dyn, so that it bends nothing in the band, and the parallel decimation at ω_fp ≥ 2 ω_dyn, with
-ω_fp = 2π 0.8 f_m / (2 n_d). His ω_dyn is the closed loop's; a log shows what of it was excited (our choice: the
-frequency below which 95 % of a joint's acceleration power lies, the floor of noise taken off, a resonance left out).
+ω_fp = 2π 0.8 f_m / (2 n_d). Gautier's ω_dyn is that of the closed loop; a log shows only the part of the band that was
+excited (our choice: the frequency below which 95 % of a joint's acceleration power lies, the floor of noise taken off,
+a resonance left out).
 """
 
 from dataclasses import dataclass
@@ -45,8 +46,9 @@ class Cutoffs:
     Attributes:
         dynamics: f_dyn of the robot [Hz].
         position: cut-off of the positions' Butterworth filter, f_q [Hz].
-        band: cut-off of the parallel decimation, f_p [Hz], factor: its n_d.
-        noise: (n,) standard deviation of white noise in the positions [rad or m], read above the motion.
+        band: cut-off of the parallel decimation, f_p [Hz], and factor: n_d of this decimation.
+        noise: (n,) standard deviation of white noise in the positions [rad or m], estimated from the spectrum above the
+            motion's band.
         reasons: explanations of the values.
     """
 
@@ -104,7 +106,7 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
 
 
 def check_cutoff(cutoff: float, rate: float, file: str = "") -> None:
-    """Refuse a cut-off [Hz] that is not between 0 and half the sampling rate."""
+    """Raise MeasurementError for a cut-off [Hz] that is not between 0 and half the sampling rate."""
     if not 0 < cutoff < rate / 2:
         message = (
             f"a cut-off of {cutoff:g} Hz is not between 0 and the Nyquist frequency, {rate / 2:g} Hz at {rate:g} Hz: "
@@ -145,7 +147,7 @@ def _active(steps: np.ndarray) -> np.ndarray:
 
 
 def _choose(per_joint: np.ndarray, dynamics: float | None) -> tuple[float, str]:
-    """Return f_dyn of the robot [Hz] and the reason: the one in the options, else by those of the joints (n,)."""
+    """Return f_dyn of the robot [Hz] and the reason: that in the options, else from those of the joints (n,)."""
     if dynamics is not None:
         return dynamics, f"f_dyn = {dynamics:.3g} Hz as stated"
     fastest = int(np.argmax(per_joint))
@@ -167,7 +169,9 @@ def _choose(per_joint: np.ndarray, dynamics: float | None) -> tuple[float, str]:
 
 
 def _joint_dynamics(f: np.ndarray, power: np.ndarray, floor: float) -> tuple[float, float]:
-    """Return the highest frequency of one joint's motion, and that of a resonance above it or NaN [Hz]."""
+    """Return the highest frequency of one joint's motion, and the frequency of a resonance above it (NaN without one)
+    [Hz].
+    """
     smooth = uniform_filter1d(power, 5, mode="nearest")
     peak = int(np.argmax(f**2 * np.maximum(smooth - MIN_ABOVE_FLOOR * floor, 0)))
     sunk = smooth[peak:] < MIN_ABOVE_FLOOR * floor

@@ -2,11 +2,11 @@
 
 Parallel decimation: the same low-pass filter and thinning for the torque and for every column of W.
 
-Filtering is linear along time, so y = W x + ρ becomes y_f = W_f x + ρ_f with the *same* x, whatever the filter: what
-lies above the band of the model (ripple, flexibility, noise) goes, and no bias comes in (Gautier's parallel decimation;
-figures below in Briot & Gautier's DualV studies and the TX40 slides). The filter is finite, even about its centre and
-evaluated at the kept samples only, so it has no phase, can run over blocks, and at the ends of a segment the rows whose
-window sticks out are left out.
+Filtering is linear along time, so y = W x + ρ becomes y_f = W_f x + ρ_f with the *same* x, whatever the filter: the
+filter removes what lies above the band of the model (ripple, flexibility, noise) and introduces no bias (Gautier's
+parallel decimation; figures below from Briot & Gautier's DualV studies and the TX40 slides). The filter is finite,
+symmetric and evaluated at the kept samples only: it has no phase and can run over blocks; rows whose window exceeds the
+ends of a segment are left out.
 """
 
 from collections.abc import Iterable, Iterator
@@ -44,8 +44,8 @@ class Decimator:
     Attributes:
         factor: n_d; 1 changes nothing.
         taps: (2 h + 1,) weights of the samples k-h … k+h, symmetric, of sum 1.
-        rate: of the signal before [Hz].
-        band: the cut-off f_p = 0.8 rate / (2 n_d) [Hz]; lower frequencies pass.
+        rate: sampling rate of the signal before decimation [Hz].
+        band: cut-off f_p = 0.8 rate / (2 n_d) [Hz]; lower frequencies pass.
     """
 
     factor: int
@@ -63,12 +63,12 @@ def design_decimator(rate: float, factor: int, kind: str = "kaiser") -> Decimato
     """Return the filter that keeps one of `factor` samples of a signal at `rate` [Hz].
 
     ``chebyshev``: Matlab's and Gautier's decimate: type I, order 8, 0.05 dB, cut-off 0.8 of the new Nyquist frequency,
-    run forwards and backwards; taken as its impulse response (the inverse transform of |H|²), cut where 1e-4 of it is
-    left: some 46 n_d samples on each side. ``kaiser``: a windowed sinc with the same band, 60 dB down from 1.2 of the
-    new Nyquist frequency on, 9 n_d samples on each side: a fifth of the work and of the lost ends (our default).
+    run forwards and backwards; taken as its impulse response (the inverse transform of |H|²), truncated where it falls
+    to 1e-4: some 46 n_d samples on each side. ``kaiser``: a windowed sinc with the same band, 60 dB down from 1.2 of
+    the new Nyquist frequency on, 9 n_d samples on each side: a fifth of the work and of the lost ends (our default).
 
     Raises:
-        CalibError: for a factor below 1 or a kind that is none.
+        CalibError: for a factor below 1 or an unknown kind.
     """
     message = f"decimation by {factor} with a '{kind}' filter: expected at least 1, and {' or '.join(KINDS)}"
     require(factor >= 1 and kind in KINDS, message)
@@ -135,7 +135,7 @@ def spread(values: np.ndarray, decimator: Decimator, length: int) -> np.ndarray:
 def decimate_blocks(blocks: Iterable[np.ndarray], decimator: Decimator) -> Iterator[np.ndarray]:
     """Yield, block by block, the decimation of one segment given as blocks (..., N_i).
 
-    The sample axis is the last one. Holds one block, and of those before it the samples that windows still need.
+    The sample axis is the last one. Memory holds one block and the earlier samples that windows still need.
     """
     r, taps = decimator.factor, decimator.taps
     if r == 1 and len(taps) == 1:
@@ -156,8 +156,8 @@ def decimate_blocks(blocks: Iterable[np.ndarray], decimator: Decimator) -> Itera
 def _windows(values: np.ndarray, taps: np.ndarray, r: int, count: int) -> np.ndarray:
     """Return the filtered values (..., count) of the first `count` windows of values (..., N), one every r samples.
 
-    As many windows at a time as one is long, as a product with their band of taps: twice the multiplications, which
-    the processor's cache makes up for many times over.
+    Windows are computed in groups as a product with a band matrix of taps: twice the multiplications, but much faster
+    owing to the processor's cache.
     """
     flat = values.reshape(-1, values.shape[-1])
     together = min(count, -(-len(taps) // r))
@@ -202,11 +202,11 @@ def too_short(motion_length: int, decimator: Decimator) -> MeasurementError:
 def low_pass(values: np.ndarray, rate: float, cutoff: float, order: int = ORDER) -> np.ndarray:
     """Return `values` (N, ...) low-passed by a Butterworth filter, forwards and backwards (no phase shift).
 
-    Gain |H(f)|² = 1 / (1 + (f/f_c)^(2 order)): 1/2 at the cut-off f_c, where one pass has 1/√2. The ends are continued
-    by their odd reflection over 3 rate/f_c samples; about 2/f_c seconds at each end are affected.
+    Gain |H(f)|² = 1 / (1 + (f/f_c)^(2 order)): 1/2 at the cut-off f_c, where a single pass has 1/√2. The ends are
+    extended by odd reflection over 3 rate/f_c samples; about 2/f_c seconds at each end are affected.
 
     Args:
-        values: with no NaN; a segment without gaps.
+        values: (N, ...) samples of a segment without gaps, no NaN.
         rate, cutoff: [Hz].
 
     Raises:
@@ -233,7 +233,7 @@ def slope(values: np.ndarray, rate: float, width: int = 4) -> np.ndarray:
 
     ẋ_k = rate Σ_i c_i (x_{k+i} - x_{k-i}). At ω and the period Δ the classic two-point form (width 1) falls short by
     (ωΔ)²/6: 6.6 % at a tenth of the sampling rate; width 4 by (ωΔ)⁸/630: 0.004 % (our default: log rates are low, and
-    the noise is the low-pass filter's business).
+    noise is removed by the low-pass filter).
     """
     return _differences(values, SLOPE[width], rate, -1.0)
 

@@ -1,12 +1,12 @@
-"""Lattice with holes: the steps at which an even clock took samples, from stamps that jitter, some samples lost.
+"""Steps of an even clock at which samples were taken (a lattice with holes), from jittering stamps with lost samples.
 
     t_i = T (k_i + d_i) + jitter_i,    k_i whole numbers that rise by 1 or more, d_i a slow drift in steps
 
-Steps between two stamps do not tell k: both stamps jitter, and a wrong step stays wrong for all later samples. The
-phase does, which each sample votes on: exp(2πi t / T) has one direction for all k. Its mean over a few samples gives
-the drift, and its length the jitter (1 without, exp(-2 π² σ² / T²) for one of σ; 0 where stamps are no lattice at all).
+Steps between two stamps do not determine k: both stamps jitter, and a wrong step falsifies all later samples. The phase
+does: exp(2πi t / T) has the same direction for all k. The direction of its mean over a few samples gives the drift, and
+the length of the mean the jitter (1 without, exp(-2 π² σ² / T²) for one of σ; 0 where stamps are no lattice at all).
 Estimation of a period from sparse, noisy times: Fogel and Gavish (1988), Sidiropoulos, Swami and Sadler (2005), who
-take the largest periodogram as here; a drift that is followed is our addition.
+take the largest periodogram as here; following a drift is our addition.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ class Lattice:
     Attributes:
         steps: (N,) whole numbers k, rising.
         period: T [s].
-        concentration: of the phases about their drift, 0 to 1.
+        concentration: concentration of the phases about their drift, from 0 (none) to 1 (no jitter).
     """
 
     steps: np.ndarray
@@ -44,7 +44,7 @@ def find_lattice(t: np.ndarray, drift_samples: int, rounds: int = 3) -> Lattice 
 
     Args:
         drift_samples: samples over which a drift of the stamps is followed.
-        rounds: of rounding the stamps to steps, and of fitting the period to them.
+        rounds: number of rounds, each rounding the stamps to steps and fitting the period to the steps.
     """
     period = _likeliest_period(t)
     steps, concentration = np.arange(len(t)), 0.0

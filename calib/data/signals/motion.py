@@ -92,10 +92,10 @@ class FilterOptions:
 class Motion:
     """Filtered motion: N samples on an even grid, in segments without gaps.
 
-    Coulomb friction bends the velocity where it changes its sign: the acceleration falls by 2 Fc / M from one side to
-    the other. A filter rounds that corner off and moves the zero to later, friction's column lags behind, and Ia, whose
-    acceleration then has the sign of what is missing, is found too large (by 2 % at f_q = 10 Hz on a simulated LWR4+).
-    Velocities stand more noise than accelerations, and so have a cut-off of their own.
+    Coulomb friction puts a corner into the velocity at a change of sign: the acceleration falls by 2 Fc / M. A filter
+    rounds the corner off and delays the zero, so that friction's column lags behind, and the motor inertia Ia is
+    estimated too large (by 2 % at f_q = 10 Hz on a simulated LWR4+). Velocities tolerate more noise than accelerations,
+    and so have a separate cut-off.
 
     Attributes:
         t: (N,) [s]; within a segment in steps of 1/rate.
@@ -107,14 +107,14 @@ class Motion:
         rate: [Hz].
         band: f_p, the identification band [Hz].
         cutoff: (n,) f_q [Hz].
-        velocity_cutoff: (n,) f_v [Hz]: of the positions that v comes from.
-        decimator: the filter of the parallel decimation to that band.
-        joint_names, kind, file, drive_gain, effort_variance: the recording's.
-        tau_link, tau_motor, q_link, q_ref, tau_ff, v_measured: (N, n) the recording's others on the grid, not
-            filtered; or None.
-        sampling, cutoffs: what was found; notes: for the user; jumps: the recording's, in words; faults: the
-            recording's.
-        located: where a designed motion that is the reference was found to begin [s]; None: another reference.
+        velocity_cutoff: (n,) f_v [Hz], cut-off of the positions from which v is computed.
+        decimator: the filter of the parallel decimation to `band`.
+        joint_names, kind, file, drive_gain, effort_variance: those of the recording. tau_link, tau_motor, q_link,
+            q_ref, tau_ff, v_measured: (N, n) further series of the recording on the grid, not filtered; None where not
+            recorded.
+        sampling, cutoffs: reports of resampling and of the cut-offs; notes: remarks for the user; jumps, faults: those
+            of the recording.
+        located: time at which a designed motion, used as the reference, begins [s]; None for another reference.
     """
 
     t: np.ndarray
@@ -177,7 +177,7 @@ class Motion:
     def velocity_noise(self, cutoff: float | None = None) -> np.ndarray:
         """Return the standard deviation (n,) of filtered velocities due to white position noise [rad/s or m/s].
 
-        With `cutoff` [Hz], in those of positions filtered to less than the motion's.
+        With `cutoff` [Hz], the noise of velocities from positions filtered at this lower cut-off.
 
         σ_v² = σ_q² (2/f_s) ∫ (2πf)² |H(f)|⁴ df with |H|² of the two passes, about σ_q² (2/f_s) (2π)² f_q³/3.
         """
@@ -194,12 +194,13 @@ def make_motion(
     """Return the motion of a recording: resampled to an even grid, low-passed without phase shift, differentiated.
 
     Args:
-        sampled: the recording on its grid if already computed with the same clock and gap.
-        cutoffs: proposed for it, if already computed with the same f_dyn.
+        sampled: the resampled recording, if already computed with the same clock and gap; None to compute it.
+        cutoffs: cut-offs proposed for `sampled`, if already computed with the same f_dyn; None to compute them.
 
     Raises:
-        MeasurementError: for a cut-off at or above the Nyquist frequency; for segments that the filters eat up.
-        UsageError: for a list of cut-offs of another length than the joints.
+        MeasurementError: for a cut-off at or above the Nyquist frequency; for segments shorter than the filters'
+            borders.
+        UsageError: if the number of cut-offs differs from the number of joints.
     """
     options = options or FilterOptions()
     if sampled is None:

@@ -37,7 +37,7 @@ class ExcitationReport:
         functions: number of independent functions of time in all positions (2 for one sine).
         poor: whether the motion is one frequency, or fewer functions of time than half the joints that move.
         seconds: duration with at least one moving joint [s].
-        notes: for the user.
+        notes: remarks for the user.
     """
 
     functions: int
@@ -89,10 +89,10 @@ def report_excitation(motion: Motion) -> ExcitationReport:
 def repeats(training: Motion, test: Motion) -> float:
     """Return the share (0 to 1) of a test motion's moving samples whose state also occurs in the training motion.
 
-    A state is (q, v); it was met before where the nearest one of the training motion differs by less than 5 % of that
-    motion's spread, in the rms over the coordinates. Neither a shift in time, nor another number of laps, nor another
-    order of parts hides a repeat; the same path at another speed is none. Evidence from a repeat is no evidence:
-    whatever the model gets wrong along that path, the fit has already absorbed (our choice: refuse from a half on).
+    A state is (q, v); it occurs in the training motion if the nearest state there differs by less than 5 % of that
+    motion's spread, rms over the coordinates. A repeat is recognised in spite of a shift in time, another number of
+    laps or another order of parts; the same path at another speed is no repeat. A repeat is no independent test: the
+    fit has already absorbed the model's errors along that path (our choice: refuse from a half on).
     """
     moves = np.ptp(training.q, axis=0) > MIN_TRAVEL
     if not moves.any() or training.n != test.n:

@@ -12,11 +12,11 @@ seems noisy is only badly dated. Three clocks are tried; the one with the smooth
 ``counted`` the number of steps between two samples from the motion itself, Δk = Δq·v̄ / (T |v̄|²), where that is whole
             numbers (v̄ the mean of the two measured velocities); zero is a sample read twice, which is left out.
 
-The measure is the rms of the fourth differences of q on the even grid. Counted steps are as long as the measured
-velocities say, unless the stamps say otherwise by more than `APART`: then one of the two is of another size, nobody
-knows which, the stamps' rate is kept, and that the velocities are no slopes is seen later. All of this is our choice.
-Seen in real logs: the Panda's is counted (6 % read twice, 7 % missed), the LWR4+'s and TIAGo's are even, the UR10e's
-stamps are true.
+The measure is the rms of the fourth differences of q on the even grid. The length of counted steps follows from the
+measured velocities, unless the stamps differ by more than `APART`: then stamps or velocities have a wrong scale, the
+stamps' rate is kept, and a later check reports velocities that are not the slopes of the positions. All of this is our
+choice. Seen in real logs: the Panda's is counted (6 % read twice, 7 % missed), the LWR4+'s and TIAGo's are even, the
+UR10e's stamps are true.
 """
 
 from dataclasses import dataclass
@@ -66,10 +66,10 @@ class SampleClock:
 
     Attributes:
         kind: one of `CLOCKS`.
-        t: (N,) [s]; those of kept samples rise strictly.
+        t: (N,) times [s]; those of kept samples rise strictly.
         keep: (N,) mask; False where a sample was read a second time.
-        period: of one step [s].
-        times: the step by the measured velocities over that by the stamps; NaN where steps are not counted.
+        period: length of one step [s].
+        times: step from the measured velocities divided by the step from the stamps; NaN where steps are not counted.
         roughness: clock → rms of the fourth differences of q under it, relative to that under the stamps.
     """
 
@@ -85,7 +85,7 @@ def find_clock(recording: Recording, kind: str = "auto") -> SampleClock:
     """Return the clock `kind`; with ``auto`` the clock with the smoothest positions.
 
     Raises:
-        UsageError: for an unknown clock, or one that this recording does not allow.
+        UsageError: for an unknown clock, or a clock that this recording does not allow.
     """
     require(kind in ("auto", *CLOCKS), f"clock: expected one of auto, {', '.join(CLOCKS)}, found '{kind}'", UsageError)
     fresh = ~_read_twice(recording)
@@ -116,8 +116,8 @@ def find_clock(recording: Recording, kind: str = "auto") -> SampleClock:
 def _read_twice(recording: Recording) -> np.ndarray:
     """Return the mask (N,) of rows that repeat the row before, in positions and torques, while the robot moves.
 
-    Such a row is the last sample read once more, since the next one is late. Rows of a robot that stands may well be
-    equal: only short runs count, between rows whose positions differ.
+    Such a row is the last sample read again because the next sample was late. Rows of a robot at rest may be equal,
+    too: only short runs between rows of different positions are marked.
     """
     q_changes = np.asarray(np.diff(recording.q, axis=0).any(axis=1))
     effort_changes = np.asarray(np.diff(recording.effort, axis=0).any(axis=1))
@@ -149,14 +149,16 @@ def _even_times(t: np.ndarray) -> tuple[np.ndarray, float] | None:
 
 
 def _counted_times(recording: Recording, keep_velocities: bool) -> tuple[np.ndarray, np.ndarray, float, float] | None:
-    """Return counted times (N,), the mask of samples not read twice, the step [s], and the step by velocities over that
-    by the stamps; None if steps are not whole.
+    """Return times from counted steps; None if steps are not whole numbers.
 
-    Where the robot is too slow to count, a repeated row counts zero, any other one; a wrong count there does little,
-    since a date's error acts through the speed. Long stops of the log (more than 20 steps) are dated by the stamps.
+    Where the robot is too slow for counting, a repeated row counts 0 and any other row 1; a wrong count matters little
+    there, since an error of time acts through the speed. Stops of the log longer than 20 steps are dated by the stamps.
 
     Args:
-        keep_velocities: whether steps are as long as the velocities say, whatever the stamps do.
+        keep_velocities: whether steps are as long as the velocities say, regardless of the stamps.
+
+    Returns:
+        Times (N,) [s], mask (N,) of samples not read twice, step [s], and step by velocities divided by step by stamps.
     """
     if recording.v is None:
         return None
@@ -286,12 +288,12 @@ class Resampled:
     """A recording resampled to an even grid.
 
     Attributes:
-        t: (N,) [s]; within a segment in steps of 1/rate.
+        t: (N,) times [s]; within a segment in steps of 1/rate.
         series: name (`calib.data.recordings.recording.SERIES`) → (N, n), in the recording's units.
         weight: (N,) 1 at a sample, 0 at a bridged one.
         segment: (N,) number of the segment, rising.
         rate: [Hz].
-        report: what was found.
+        report: quality of the recording's stamps.
     """
 
     t: np.ndarray
@@ -308,10 +310,10 @@ def resample(recording: Recording, clock: str = "auto", gap: float = GAP, rate: 
     Args:
         clock: ``auto`` or one of `calib.data.signals.resampling.CLOCKS`.
         gap: the longest time without a sample that is bridged [s], at least 5 periods.
-        rate: of the grid [Hz]; None for the recording's own. A lower one is not protected against aliasing.
+        rate: sampling rate of the grid [Hz]; None for the recording's. A lower rate is not protected against aliasing.
 
     Raises:
-        MeasurementError: where no segment is long enough.
+        MeasurementError: if no segment is long enough.
     """
     sample_clock = find_clock(recording, clock)
     t = sample_clock.t[sample_clock.keep]
@@ -369,7 +371,7 @@ def _sampling_report(
     """Return the quality of a recording's stamps.
 
     Args:
-        t: (N,) times of the kept samples [s], of whose steps (N - 1,) `is_gap` marks those too long to bridge.
+        t: (N,) times of the kept samples [s]. is_gap: (N - 1,) mask of the steps too long to bridge.
         dropped: (start, length) [s] of segments too short to use.
     """
     step = np.diff(t)

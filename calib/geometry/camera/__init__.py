@@ -1,1 +1,1 @@
-"""What images say of the geometry: first guesses, residuals of corners."""
+"""Images in the fit of the geometry: first guesses of camera and board, residuals of corners."""

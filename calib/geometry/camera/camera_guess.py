@@ -1,4 +1,4 @@
-"""Initial values for a fit of images: lens, mounting (camera or board on the arm), and placements.
+"""Initial values for a fit of images: lens, mounting (camera or board on the arm), placements of camera and board.
 
 Each image gives the board's pose from its corners alone (`calib.data.images.board_and_lens`); with the arm's poses a
 closed form places camera and board (`calib.geometry.camera.robust_placement`). Both ways of mounting are tried.
@@ -55,10 +55,10 @@ class CameraPlacement:
     """Estimated placement of camera and board for one block of images.
 
     Attributes:
-        rows: (k,) the rows that were looked at.
-        poses: (k, 4, 4) of the board in the camera's frame, by PnP.
-        mounting: ``in hand`` or ``to hand``.
-        placed: station and tool.
+        rows: (k,) rows of the block from which the placement was estimated.
+        poses: (k, 4, 4) poses of the board in the camera's frame, computed from the corners (PnP).
+        mounting: ``in hand`` (camera on the arm) or ``to hand`` (board on the arm).
+        placed: estimated station and tool.
     """
 
     rows: np.ndarray
@@ -70,12 +70,13 @@ class CameraPlacement:
 def complete_camera(chain: Chain, block: Pixels, fitted_blocks: Sequence[PoseMeasurements] = ()) -> Pixels:
     """Return a block of images with its lens and mounting; refuse images that contradict the arm's motion.
 
+    Corners that contradict their own image, and images that contradict all others, are removed and named in the block's
+    notes.
+
     Args:
         chain: the nominal arm.
-        block: of images.
-        fitted_blocks: blocks fitted already; the lens of one with images of this size is taken over.
-
-    Corners that do not fit into their own image, and images that contradict all others, are left out and named.
+        block: the block of images.
+        fitted_blocks: blocks fitted already; the lens of a block with images of the same size is taken over.
 
     Raises:
         MeasurementError: where images and joints do not belong together, or the board is not of the stated size.
@@ -104,7 +105,9 @@ def complete_camera(chain: Chain, block: Pixels, fitted_blocks: Sequence[PoseMea
 
 
 def _with_fitted_lens(block: Pixels, fitted_blocks: Sequence[PoseMeasurements]) -> Pixels:
-    """Return the block with the lens of the first fitted block of images of its size; unchanged without any."""
+    """Return the block with the lens of the first fitted block with images of its size; unchanged if there is no such
+    block.
+    """
     for fitted in fitted_blocks:
         if isinstance(fitted, Pixels) and fitted.size == block.size and fitted.lens is not None:
             return replace(block, lens=fitted.lens, mounting=block.mounting or fitted.mounting, free=())
@@ -119,7 +122,7 @@ def _lens_of(block: Pixels) -> Lens:
 
 
 def _own_poses(block: Pixels, rows: np.ndarray) -> np.ndarray:
-    """Return the board's pose (k, 4, 4) in the camera's frame for each of some rows (k,)."""
+    """Return the board's pose in the camera's frame (k, 4, 4) for each of the given rows (k,) of a block."""
     lens = _lens_of(block)
     chunks = np.array_split(rows, len(rows) // MAX_AT_ONCE + 1)
     return np.concatenate([board_poses(lens, block.board, block.pixel[chunk]).poses for chunk in chunks])
@@ -128,7 +131,8 @@ def _own_poses(block: Pixels, rows: np.ndarray) -> np.ndarray:
 def _without_gross_corners(block: Pixels, poses: np.ndarray) -> Pixels:
     """Return the block without outlier corners; the removed corners are named in its notes.
 
-    A gross corner moves the pose that the others are judged by: the worst go first, and poses (m, 4, 4) are found anew.
+    A gross corner falsifies its image's pose, by which the other corners are judged: the worst corners are removed
+    first, then the board's poses (m, 4, 4) are computed again.
     """
     lens, table, before = _lens_of(block), corners(block.board), block.seen
     distance = np.full(before.shape, np.nan)
@@ -157,8 +161,14 @@ def _without_gross_corners(block: Pixels, poses: np.ndarray) -> Pixels:
 def _strangers(block: Pixels, arm: np.ndarray, placed: Placement, poses: np.ndarray) -> tuple[np.ndarray, str]:
     """Return the rows of images that contradict the other images, and a sentence that names them.
 
+    Args:
+        block: the images.
+        arm: (m, 4, 4) poses of the tip in the base.
+        placed: the placement estimated from all images.
+        poses: (m, 4, 4) poses of the board in the camera's frame.
+
     Raises:
-        MeasurementError: where they are many.
+        MeasurementError: if many images contradict the others.
     """
     lever = float(np.median(np.linalg.norm(poses[:, :3, 3], axis=1)))
 
@@ -188,7 +198,7 @@ def _strangers(block: Pixels, arm: np.ndarray, placed: Placement, poses: np.ndar
 
 
 def seen_target(mounting: str, poses: np.ndarray) -> np.ndarray:
-    """Return the moving body's poses (m, 4, 4) in the fixed one's frame (camera and board), from board poses."""
+    """Return the poses (m, 4, 4) of the carried one of camera and board in the fixed one's frame, from board poses."""
     if mounting == IN_HAND:
         return invert(poses)
     return poses
@@ -211,10 +221,10 @@ def pnp_poses(block: Pixels) -> Poses:
 
 
 def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:
-    """Return the placement of camera and board for a block of images; the mounting with the smaller error is taken.
+    """Return the placement of camera and board for a block of images, for the mounting with the smaller error.
 
     Args:
-        block: with its lens.
+        block: images with their lens.
         arm: (m, 4, 4) poses of the tip in the base.
 
     Raises:
@@ -251,7 +261,7 @@ def place_camera(block: Pixels, arm: np.ndarray) -> CameraPlacement:
 def _check_pairing(
     block: Pixels, arm: np.ndarray, poses: np.ndarray, mountings: Sequence[str], placed: Placement, lever: float
 ) -> None:
-    """Raise if the joint values are shifted against the images by some rows, or do not match them at all."""
+    """Raise MeasurementError if the joint values are shifted against the images by some rows, or do not match."""
     if placed.error <= 0.01 * lever or len(arm) < 6:
         return
     count = len(arm)
@@ -279,9 +289,9 @@ def _check_pairing(
 
 
 def _check_square(block: Pixels, arm: np.ndarray, placement: CameraPlacement) -> None:
-    """Raise if the stated square size contradicts the size computed from the arm's motion.
+    """Raise MeasurementError if the stated square size contradicts the size computed from the arm's motion.
 
-    Of B_i = S A_i X with the board's lengths times λ, for fixed rotations, the translations are linear in λ.
+    In B_i = S A_i X with the board's lengths multiplied by λ, the translations are linear in λ for fixed rotations.
     """
     placed = placement.placed
     count = len(arm)
@@ -316,7 +326,7 @@ def optics_of(measured: Sequence[Pixels]) -> Optics:
     """Return the lenses and boards of all image blocks; a camera's lens is that of its first block.
 
     Raises:
-        MeasurementError: for images whose camera is not known, or one camera with images of two sizes.
+        MeasurementError: if a block's camera is not known, or one camera has images of two sizes.
     """
     lenses, boards, free = {}, {}, set[str]()
     for block in measured:
@@ -339,7 +349,10 @@ def optics_of(measured: Sequence[Pixels]) -> Optics:
 def _guess_frames(
     block: Pixels, arm: np.ndarray, rows: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return station and tool (4, 4) of a block of images, from the arm's poses (m, 4, 4); one may be given."""
+    """Return station and tool (4, 4) of a block of images, from the arm's poses (m, 4, 4).
+
+    A `station` or `tool` that is given stays; None for one to be estimated.
+    """
     placement = place_camera(block, arm)
     if station is None and tool is None:
         return placement.placed.station, placement.placed.tool

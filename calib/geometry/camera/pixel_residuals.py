@@ -6,15 +6,15 @@ with (R, p) the board in the camera's frame. All corners of an image share the s
 2K x (6 + k + 1) matrix leaves 6 + k + 1 rows of the least-squares problem, the same problem (Golub & Van Loan 2013,
 sec. 5.3), so that thousands of images take the memory of thousands of poses.
 
-Noise of images: of each corner alone, and of all corners of an image together.
+Noise of images has two parts: that of each corner alone, and that common to all corners of an image.
 
     r_i = J_i M_i ξ_i + ε_i,   ε ~ N(0, f² σ²),   ξ ~ N(0, diag(s_v², s_v², s_v², s_ω², s_ω², s_ω²))
 
-ξ is what the arm does not repeat and the model does not explain: a displacement and a turn of what the arm carries,
-common to all corners of the image (M_i takes them to the board's twist). Were it left out, forty-eight corners would
-count as forty-eight measurements of the arm. Both variances are estimated: f from what remains in each image after its
-own best pose (2K - 6 numbers), s_v and s_ω by moments of those best poses' residuals beyond what ε explains
-(variance components; Rao 1972).
+ξ is the part of a pose that the arm does not repeat or the model does not explain: a displacement and a rotation of
+what the arm carries, common to all corners of the image (M_i takes them to the board's twist). Without this common
+part, forty-eight corners would count as forty-eight measurements of the arm. Both variances are estimated: f from what
+remains in each image after its own best pose (2K - 6 numbers), s_v and s_ω by moments of those best poses' residuals
+beyond what ε explains (variance components; Rao 1972).
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ class ImageNoise(Frozen):
     """Noise estimates of one block of images.
 
     Attributes:
-        factor: of the corners' stated sigmas.
-        displacement: s_v [m].
-        turn: s_ω [rad].
+        factor: f, the factor on the corners' stated sigmas.
+        displacement: s_v, standard deviation of the displacement common to an image [m].
+        turn: s_ω, standard deviation of the rotation common to an image [rad].
         weight: (m,) robust weight of each image.
-        shared: (N, 2, 6) what one standard deviation of each component of ξ does to the corners [px] at a state that
-            the fit began at, so that a fit has one metric; None: of the state at hand.
+        shared: (N, 2, 6) displacement of the corners [px] by one standard deviation of each component of ξ, evaluated
+            where the fit began, so that a whole fit has one metric; None to evaluate it at the present state.
     """
 
     factor: float = 1.0
@@ -92,10 +92,10 @@ class OwnPoses:
     """Results of fitting a free pose to each of k images.
 
     Attributes:
-        residual: (k, 6) of what the arm carries: best pose minus predicted [v; ω].
-        information: (k, 6, 6) of it, at the stated sigmas.
-        within: (k,) squared residual that the own pose leaves, in sigmas.
-        spare: (k,) numbers that are left for it, 2K - 6.
+        residual: (k, 6) best minus predicted pose of what the arm carries, as [v; ω].
+        information: (k, 6, 6) information matrix (inverse covariance) of `residual`, at the stated sigmas.
+        within: (k,) sum of squared residuals of the image's corners after the free pose, in sigmas.
+        spare: (k,) degrees of freedom of `within`, 2K - 6 for K corners.
     """
 
     residual: np.ndarray
@@ -108,9 +108,9 @@ def estimate_noise(fits: OwnPoses, unknowns: int, loss: str = "none", scale: flo
     """Return the noise of the images, estimated from the residuals of a fit.
 
     Args:
-        fits: of a free pose to each image.
-        unknowns: parameters fitted to them.
-        loss, scale: of a robust fit, for the images' weights.
+        fits: fits of a free pose to each image.
+        unknowns: number of parameters fitted to the images.
+        loss, scale: the robust loss and its constant, from which the images' weights follow.
     """
     k = len(fits.spare)
     share = max(1.0 - unknowns / max(6 * k, 1), 0.2)
@@ -143,8 +143,8 @@ def _component(square: np.ndarray, explained: np.ndarray) -> float:
     """Return the standard deviation s with E[t²] = s² + c, by maximum likelihood: Σ (t² - s² - c)/(s² + c)² = 0.
 
     Args:
-        square: t² of each residual.
-        explained: c, its variance that is known.
+        square: t², the square of each residual.
+        explained: c, the known part of each residual's variance.
     """
     excess = square - explained
     value = max(float(np.mean(excess)), 1e-3 * float(np.median(square)))
@@ -162,15 +162,16 @@ class PixelPart(ResidualPart):
 
     Attributes:
         value, sigma: (2, N) [px].
-        jacobian: (f, 6 + k, m) of the board's twist [v; ω] in the camera's axes, and of lens and board.
-        index: (N,) image of each corner.
-        local: (N, 2, 6 + k) derivative of the corner by those.
-        corner: (N,) its number in the board's table.
-        depth: (N,) pixels per metre there, across the line of sight.
-        axes: (m, 3, 3) a displacement of what the arm carries, in the station's axes, per one of the board in the
-            camera's.
+        jacobian: (f, 6 + k, m) derivatives, by f parameters, of the board's twist [v; ω] in the camera's axes and of
+            the k values of lens and board.
+        index: (N,) number of the image of each corner.
+        local: (N, 2, 6 + k) derivative of the corner by the rows of `jacobian` [px per unit].
+        corner: (N,) number of each corner in the board's table.
+        depth: (N,) pixels per metre at the corner's distance, across the line of sight.
+        axes: (m, 3, 3) displacement of what the arm carries (camera or board), in the station's axes, per displacement
+            of the board in the camera's axes.
         carried: (m, 6, 6) the board's twist per twist [v; ω] of what the arm carries, both in the camera's axes.
-        noise: an `ImageNoise`; None for that of the scale alone.
+        noise: noise common to the corners of an image; None if corners have their own noise (`scale`) only.
     """
 
     local: np.ndarray
@@ -245,7 +246,9 @@ class PixelPart(ResidualPart):
         return np.einsum("ncl,nlk->nck", by_twist, self.carried[self.index]) * noise.deviations
 
     def own_poses(self, scale: np.ndarray) -> OwnPoses:
-        """Return the fit of a free pose to each image, with corner σ `scale` (2, N) [px]."""
+        """Return the results of fitting a free pose to each image, for corners with standard deviations `scale` (2, N)
+        [px].
+        """
         images, first = np.unique(self.index, return_index=True)
         counts = np.diff(np.append(first, len(self.index)))
         columns = [self.local[:, :, :6], self.value.T[:, :, None]]
@@ -277,7 +280,13 @@ class PixelPart(ResidualPart):
 
 
 def _padded(table: np.ndarray, counts: np.ndarray, height: int = 0) -> np.ndarray:
-    """Return corner rows (N, 2, w) as one block per image (images, height, w), filled up with zeros."""
+    """Return corner rows (N, 2, w) as one block per image (images, height, w), padded with zeros.
+
+    Args:
+        table: (N, 2, w) rows, ordered by image.
+        counts: (images,) corners per image.
+        height: height of a block, twice the corners it has space for; 0 for the image with the most corners.
+    """
     width = table.shape[2]
     max_corners = height // 2
     if not max_corners:
@@ -360,9 +369,9 @@ def _twist_of_board(jacobian: np.ndarray, turn: np.ndarray, origin: np.ndarray) 
     With the board at (R, o) in the camera's frame, ω' = -R ω and o' = -R v + ω' × o.
 
     Args:
-        jacobian: (f, 6, m) of the camera, in the board's axes.
-        turn: (m, 3, 3) R.
-        origin: (m, 3) o [m].
+        jacobian: (f, 6, m) twist of the camera in the board's axes, per unit of f parameters.
+        turn: (m, 3, 3) rotation R.
+        origin: (m, 3) translation o [m].
     """
     omega = -np.einsum("mij,fjm->fim", turn, jacobian[:, 3:])
     velocity = -np.einsum("mij,fjm->fim", turn, jacobian[:, :3])

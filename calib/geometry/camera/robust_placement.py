@@ -2,9 +2,9 @@
 
 * Shah (2013): rotations by the Kronecker product's first singular pair, then translations;
 * Li, Wang & Wu (2010): rotations and translations at once, S⁻¹ B_i = A_i X as one homogeneous linear system;
-* Park & Martin (1994): AX = XB of the motions between images for X, then S as the mean of what each image says.
+* Park & Martin (1994): AX = XB of the motions between images for X, then S as the mean over the images.
 
-The best is the one with the smallest median misfit. Images that contradict the rest are left out, a few times.
+The best solution has the smallest median misfit. Images that contradict the others are removed, a few times over.
 """
 
 from collections.abc import Callable
@@ -27,9 +27,9 @@ class Placement:
     """Placement of camera and board from m poses, by one closed-form method.
 
     Attributes:
-        method: its name.
-        station, tool: S and X (4, 4).
-        misfit: (m,) distance between B_i and S A_i X at the target, a turn counting with its lever [m].
+        method: name of the closed-form method.
+        station, tool: S and X (4, 4), with B_i = S A_i X.
+        misfit: (m,) distance between B_i and S A_i X at the target, rotations multiplied by a lever [m].
     """
 
     method: str
@@ -39,7 +39,7 @@ class Placement:
 
     @property
     def error(self) -> float:
-        """Median misfit [m]."""
+        """Median of the misfit over the poses [m]."""
         return float(np.median(self.misfit))
 
 
@@ -49,7 +49,7 @@ def place_robustly(arm: np.ndarray, targets: np.ndarray, lever: float) -> Placem
     Args:
         arm: (m, 4, 4) poses A_i of the tip in the base.
         targets: (m, 4, 4) poses B_i of the target in the station's frame.
-        lever: what a radian counts in the misfit [m].
+        lever: length by which rotations [rad] are multiplied in the misfit [m].
     """
     methods: dict[str, Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]] = {
         "Shah": by_orientations,
@@ -77,7 +77,7 @@ def place_robustly(arm: np.ndarray, targets: np.ndarray, lever: float) -> Placem
 
 
 def by_li(arm: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return S and X with B_i = S A_i X, from Z B_i = A_i X, Z = S⁻¹: 12 linear equations a pose in 24 unknowns."""
+    """Return S and X (4, 4) with B_i = S A_i X: Z B_i = A_i X, Z = S⁻¹, 12 linear equations per pose in 24 unknowns."""
     m = len(arm)
     eye = np.eye(3)
     R_a, t_a = arm[:, :3, :3], arm[:, :3, 3]
@@ -101,7 +101,9 @@ def by_li(arm: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def by_park_martin(arm: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return S and X; with M = A_i⁻¹ A_j and N = B_i⁻¹ B_j, M X = X N: log R_M = R_X log R_N, then t_X linearly."""
+    """Return S and X (4, 4) by AX = XB: with M = A_i⁻¹ A_j, N = B_i⁻¹ B_j, M X = X N gives log R_M = R_X log R_N, then
+    t_X.
+    """
     order = np.argsort(Rotation.from_matrix(arm[:, :3, :3]).as_rotvec()[:, 0])
     first, second = order, np.roll(order, max(1, len(order) // 2))
     arm_motion = invert(arm[first]) @ arm[second]

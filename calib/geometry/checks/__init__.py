@@ -1,1 +1,1 @@
-"""Checks of measurements by what a rigid arm leaves: what changed while measuring, readings that are none."""
+"""Checks of measurements by the residuals of a rigid arm: changes while measuring, invalid readings, wrong rows."""

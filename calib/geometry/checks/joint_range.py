@@ -1,7 +1,7 @@
-"""How far a fit holds: the measured range of the joints, and σ of the target's position over their whole range.
+"""Joint range in which a fit is valid: measured range of the joints, and σ of the target over their whole range.
 
-A fit to poses of one region determines what moves the target there; elsewhere other combinations of parameters count.
-What the data and the making of the arm leave open of them is their posterior,
+A fit to poses of one region determines the parameters that move the target in that region; elsewhere other combinations
+of parameters matter. The uncertainty that remains after the data and the prior of making is the posterior,
 
     C = (Wᵀ W + Λ)⁻¹,   σ² = tr(J C Jᵀ),
 
@@ -34,15 +34,16 @@ MIN_PRECISION = 1e-12
 
 @dataclass(frozen=True)
 class JointRange:
-    """Range of the joints in which a fit was made, and what it promises over their whole range.
+    """Range of the joints in which a fit was made, and its expected error over their whole range.
 
     Attributes:
-        joints, units: (n,) names; rad or m.
+        joints, units: (n,) names of the joints, and ``rad`` or ``m``.
         lower, upper: (n,) measured range [rad or m].
-        shares: (n,) measured range over the whole one, a turn at most.
-        sigma: of the target's position over the whole range, rms [m]; None where no positions were measured.
-        nominal: error of the nominal arm over the whole range by the calibrated one, rms [m]; None as for sigma.
-        left: error that the rigid arm leaves at the fitted poses, rms [m].
+        shares: (n,) measured range divided by the joint's whole range (one turn at most).
+        sigma: rms over the whole range of σ of the target's position [m]; None where no positions were measured.
+        nominal: rms error of the nominal arm over the whole range, the calibrated arm taken as true [m]; None as for
+            `sigma`.
+        left: rms residual of the rigid arm at the fitted poses [m].
     """
 
     joints: tuple[str, ...]
@@ -56,7 +57,7 @@ class JointRange:
 
     @property
     def moved(self) -> list[int]:
-        """Indices of the joints that did not stand still."""
+        """Indices of the joints that moved while measuring."""
         return [j for j, (low, high) in enumerate(zip(self.lower, self.upper)) if high - low > STILL]
 
 
@@ -65,7 +66,7 @@ def joint_range(fit: GeometricFit, nominal: Installation) -> JointRange:
 
     Args:
         fit: the fit without joint corrections.
-        nominal: the arm as it was, placed for the same rows.
+        nominal: the nominal arm, with stations and tools fitted to the same rows.
     """
     chain = fit.cell.chain
     blocks = [block.measured for block in fit.blocks]
@@ -99,8 +100,8 @@ def joint_range(fit: GeometricFit, nominal: Installation) -> JointRange:
 def sigma_at(cell: Installation, fit: GeometricFit, q: np.ndarray) -> np.ndarray:
     """Return σ of the first target's position (m,) [m] at postures q (m, n), in its station's frame.
 
-    The fit's covariance where all rigid parameters were its candidates, else the posterior of its data and
-    the prior of making (`calib.geometry.fit.PLAUSIBLE`).
+    It follows from the fit's covariance where all rigid parameters were candidates, else from the posterior of its data
+    and the prior of making (`calib.geometry.fit.PLAUSIBLE`).
     """
     table = layout(cell)
     columns = table.rigid_index
@@ -115,7 +116,7 @@ def sigma_at(cell: Installation, fit: GeometricFit, q: np.ndarray) -> np.ndarray
 
 
 def _posterior(cell: Installation, fit: GeometricFit, columns: np.ndarray) -> np.ndarray:
-    """Return the covariance of the parameters `columns` by the data of a fit and the prior of making."""
+    """Return the covariance (c, c) of the parameters `columns` (c,), from the data of a fit and the prior of making."""
     square = np.zeros((len(columns), len(columns)))
     for number, block in enumerate(fit.blocks):
         pieces = [piece for piece in fit.pieces if piece.block == number]
@@ -130,7 +131,7 @@ def _posterior(cell: Installation, fit: GeometricFit, columns: np.ndarray) -> np
 
 
 def _positions_at(cell: Installation, fit: GeometricFit, q: np.ndarray) -> Positions:
-    """Return positions of the first target that an installation would measure at postures (m, n)."""
+    """Return measurements of the first target as an installation predicts them at postures (m, n) [rad or m]."""
     measured = next(block.measured for block in fit.blocks if isinstance(block.measured, Positions))
     block = Positions(
         q,
@@ -144,7 +145,7 @@ def _positions_at(cell: Installation, fit: GeometricFit, q: np.ndarray) -> Posit
 
 
 def _nominal_error(fit: GeometricFit, nominal: Installation, q: np.ndarray) -> float | None:
-    """Return the rms error [m] of the nominal arm at postures (m, n) if the calibrated one is the true arm."""
+    """Return the nominal arm's rms error [m] at postures (m, n) if the calibrated arm is true; or None."""
     block = _positions_at(fit.cell, fit, q)
     with suppress(CalibError):
         placed = polish_frames(nominal, [block]).cell

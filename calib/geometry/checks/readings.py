@@ -1,4 +1,4 @@
-"""Readings that are none: one number at several postures (a lost beam, a placeholder), copies of another target."""
+"""Invalid readings: one value repeated at several postures (a lost beam, a placeholder), copies of another target."""
 
 from collections.abc import Sequence
 from itertools import combinations
@@ -20,11 +20,11 @@ MIN_COPIES = 3
 
 
 def repeated_readings(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> list[Finding]:
-    """Return findings on rows with one reading at several postures, and on targets with the readings of another.
+    """Return findings on rows that repeat one reading at several postures, and on targets with the readings of another.
 
     Args:
-        nominal: the arm as it was, placed.
-        blocks: the rows.
+        nominal: the nominal arm, with stations and tools placed.
+        blocks: the measurements.
     """
     findings: list[Finding] = []
     for block in blocks:
@@ -37,14 +37,14 @@ def repeated_readings(nominal: Installation, blocks: Sequence[PoseMeasurements])
 
 
 def _readings(block: Positions) -> np.ndarray:
-    """Return the number of each row's reading (m,), the same for equal ones."""
+    """Return a number (m,) for each row's reading; rows with equal readings have equal numbers."""
     rounded = np.round(block.position / SAME)
     _, number = np.unique(rounded, axis=0, return_inverse=True)
     return number.reshape(-1)
 
 
 def _copied_targets(block: Positions) -> list[Finding]:
-    """Return findings on targets that have the readings of another one in all poses that measured both."""
+    """Return findings on targets whose readings equal another target's in all poses at which both were measured."""
     readings = _readings(block)
     # per target: its readings by row number
     reading_of_row = []
@@ -76,7 +76,13 @@ def _copied_targets(block: Positions) -> list[Finding]:
 
 
 def _stale(nominal: Installation, block: Positions, copied: set[str]) -> list[Finding]:
-    """Return findings on the readings of a target that stay while the joints move it."""
+    """Return findings on readings of a target that stay constant while the joints move the target.
+
+    Args:
+        nominal: the nominal arm, with stations and tools placed.
+        block: measured positions.
+        copied: names of targets known to be copies, which are skipped.
+    """
     (prepared,) = prepare(nominal, [block])
     predicted = positions(nominal, prepared).T
     readings = _readings(block)

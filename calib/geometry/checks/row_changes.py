@@ -1,17 +1,19 @@
-"""What changed while measuring: a table of hypotheses, each tried on the residuals of the rigid fit and its Jacobian.
+"""Changes of the set-up while measuring: a table of hypotheses, each tested on the residuals of the rigid fit.
 
 Row order is time. A hypothesis says that a placement, a target, the zero of a joint or the instrument's scale changed
 in steps or drifted, so that r = W x + s(row) H d + noise: W the observation matrix of all rigid parameters with a prior
-of making, H the columns of what changed, s(row) a step behind one row or a ramp over all. By the score test (Rao 1948)
-a change lowers the penalised sum of squares by
+of making, H the columns of the changed parameters, s(row) a step behind one row or a ramp over all rows. By the score
+test (Rao 1948) a change lowers the penalised sum of squares by
 
     gain = gᵀ S⁻¹ g,   g = Σ s Hᵀ e,   S = Σ s² HᵀH - (Σ s HᵀQ)(Σ s HᵀQ)ᵀ,   Q = W (WᵀW + Λ)^(-1/2)
 
-with e what remains after fitting x. All sums over rows behind a cut are cumulative ones, so that every cut is tried.
+with e the residuals after fitting x. The sums over the rows behind a cut are cumulative sums, so that every cut is
+tried.
 
 A change is found where it explains the residuals: by Fisher's test with the number of hypotheses (Bonferroni), by the
-share that remains, on rows that did not determine it, and much better than the same change over the order of a joint's
-values or of the target's coordinates, as an effect that the arm's model lacks would.
+share of the residuals that remains, on held-out rows, and if it explains them much better than the same change over
+rows ordered by a joint's values or the target's coordinates does (which an effect missing in the arm's model would
+cause).
 """
 
 from collections.abc import Iterator, Sequence
@@ -64,12 +66,12 @@ class WhitenedRows:
     """Whitened rows of one block, in the order of its file.
 
     Attributes:
-        block: the rows.
-        residual: (m, d) of d measured numbers per row.
-        matrix: (m, d, f) columns of all rigid parameters.
-        precision: (f,) of the parameters' prior.
-        pull: (f,) precision times how far the prior's mean is away.
-        metres: (m,) divisor of the positions' numbers [m].
+        block: the measurements.
+        residual: (m, d) residuals of d measured numbers per row, in sigmas.
+        matrix: (m, d, f) derivatives by all f rigid parameters, in sigmas per unit.
+        precision: (f,) precision of the parameters' prior.
+        pull: (f,) precision times the distance of the prior's mean from the present value.
+        metres: (m,) standard deviation that whitened each row's position [m].
     """
 
     block: Block
@@ -80,13 +82,13 @@ class WhitenedRows:
     metres: np.ndarray
 
     def some(self, rows: np.ndarray) -> "WhitenedRows":
-        """Return some of the rows."""
+        """Return the whitened rows with the given row numbers or mask."""
         measured = take(self.block.measured, rows)
         block = Block(measured, self.block.station, self.block.tool[rows])
         return WhitenedRows(block, self.residual[rows], self.matrix[rows], self.precision, self.pull, self.metres[rows])
 
     def with_columns(self, columns: np.ndarray) -> "WhitenedRows":
-        """Return the rows with further columns (m, d, k), of what changed."""
+        """Return the rows with the columns (m, d, k) of changed parameters appended to `matrix`, without a prior."""
         count = columns.shape[2]
         matrix = np.concatenate([self.matrix, columns], axis=2)
         precision = np.append(self.precision, np.full(count, CHANGED**-2.0))
@@ -102,7 +104,7 @@ class WhitenedRows:
         return square + np.diag(self.precision + rounding)
 
     def residuals(self, estimate: np.ndarray) -> np.ndarray:
-        """Return the residuals (m, d) with an estimate."""
+        """Return the residuals (m, d) that remain with parameter changes `estimate` (f,), in sigmas."""
         return self.residual - self.matrix @ estimate
 
     def solve(self) -> np.ndarray:
@@ -112,24 +114,24 @@ class WhitenedRows:
         return scipy.linalg.solve(self.normal(), right, assume_a="pos")
 
     def position_rms(self, residuals: np.ndarray) -> float:
-        """Return the rms of position residuals [m] of whitened ones (m, d)."""
+        """Return the rms norm of the position residuals [m], from whitened residuals (m, d)."""
         squares = np.sum(residuals[:, :3] ** 2, axis=1)
         return float(np.sqrt(np.mean(squares * self.metres**2)))
 
     def resting(self) -> float:
-        """Return the number of parameters that rest on their prior."""
+        """Return the effective number of parameters determined by their prior instead of the rows."""
         variances = np.diag(scipy.linalg.inv(self.normal()))
         return float(np.sum(self.precision * variances))
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """What may have changed.
+    """A part of the set-up that may have changed while measuring: station, scale, target or joint zero.
 
     Attributes:
-        code: of its findings in `STEPS` and `DRIFTS`.
-        name: of the station, target or joint; of the instrument's scale the station's.
-        columns: (m, d, k) derivatives of the rows by its k numbers, whitened.
+        code: key of its findings in `STEPS` and `DRIFTS`.
+        name: name of the station, target or joint; for the instrument's scale, name of its station.
+        columns: (m, d, k) whitened derivatives of the rows by the subject's k parameters.
     """
 
     code: str
@@ -138,18 +140,18 @@ class Subject:
 
     @property
     def count(self) -> int:
-        """Number of its numbers k."""
+        """Number k of the subject's parameters."""
         return self.columns.shape[2]
 
 
 @dataclass(frozen=True, eq=False)
 class RowChange:
-    """A change of one subject over an order of the rows.
+    """A step or drift of one subject over the rows in some order.
 
     Attributes:
         subject: what changed.
         shape: (m,) factor of the change at each row: 0 and 1, or a ramp.
-        between: values of the order before and behind the step; None for a drift.
+        between: the ordering values just before and behind the step; None for a drift.
         gain: reduction of the penalised sum of squares.
     """
 
@@ -160,12 +162,12 @@ class RowChange:
 
     @property
     def columns(self) -> np.ndarray:
-        """(m, d, k) columns that the change adds."""
+        """Columns (m, d, k) that the change adds to the whitened matrix: the subject's times `shape`."""
         return self.shape[:, None, None] * self.subject.columns
 
 
 def row_changes(fit: GeometricFit) -> list[Finding]:
-    """Return findings on what changed while the rows of each block were measured.
+    """Return findings on the parts of the set-up that changed while the rows of each block were measured.
 
     Args:
         fit: a fit without joint corrections.
@@ -186,7 +188,7 @@ def row_changes(fit: GeometricFit) -> list[Finding]:
 
 
 def _rows_of(fit: GeometricFit, number: int) -> WhitenedRows:
-    """Return a block's rows, whitened, with the columns of all rigid parameters."""
+    """Return the rows of block `number` of a fit, whitened, with the columns of all rigid parameters."""
     measured = fit.blocks[number].measured
     (block,) = prepare(fit.cell, [take(measured, evenly(len(measured), MAX_ROWS))])
     table = layout(fit.cell)
@@ -208,7 +210,7 @@ def _rows_of(fit: GeometricFit, number: int) -> WhitenedRows:
 
 
 def _without_gross(rows: WhitenedRows) -> WhitenedRows:
-    """Return the rows without those that are far off whatever the rigid arm, which would hide all else."""
+    """Return the rows without gross outliers of the rigid fit, which would hide every smaller change."""
     for _ in range(GROSS_PASSES):
         size = np.linalg.norm(rows.residuals(rows.solve()), axis=1)
         fine = size <= GROSS * np.median(size)
@@ -219,7 +221,7 @@ def _without_gross(rows: WhitenedRows) -> WhitenedRows:
 
 
 def _subjects(fit: GeometricFit, rows: WhitenedRows) -> list[Subject]:
-    """Return what may have changed: the station, the instrument's scale, each target, and the zero of each joint."""
+    """Return the parts that may have changed: station, instrument's scale, each target, the zero of each joint."""
     cell = fit.cell
     table = layout(cell)
     column = {table.names[k]: number for number, k in enumerate(table.index("arm", "station", "tool"))}
@@ -245,7 +247,7 @@ def _subjects(fit: GeometricFit, rows: WhitenedRows) -> list[Subject]:
 
 
 def _best_change(rows: WhitenedRows, subjects: Sequence[Subject]) -> RowChange | None:
-    """Return the change over the rows that explains the residuals; None where none does."""
+    """Return the change over time (row order) that explains the residuals best; None if none does significantly."""
     residuals = rows.residuals(rows.solve())
     cost = float(np.sum(residuals**2))
     count = residuals.size
@@ -269,12 +271,19 @@ def _best_change(rows: WhitenedRows, subjects: Sequence[Subject]) -> RowChange |
 
 
 def _information(cost: float, count: int, parameters: int) -> float:
-    """Return Schwarz's criterion of a fit of `count` numbers."""
+    """Return Schwarz's criterion (BIC) of a fit: `cost` its sum of squares, `count` numbers, `parameters` unknowns."""
     return count * np.log(max(cost, 1e-300)) + parameters * np.log(count)
 
 
 def _significant(change: RowChange, cost: float, dof: float, hypotheses: int) -> bool:
-    """Return whether a change explains the residuals by Fisher's test, and leaves little of them."""
+    """Return whether a change is significant by Fisher's test and leaves only a small share of the residuals.
+
+    Args:
+        change: the change.
+        cost: sum of squares without it.
+        dof: degrees of freedom of `cost`.
+        hypotheses: number of changes tried (Bonferroni).
+    """
     # slow to load
     from scipy.stats import f
 
@@ -292,10 +301,10 @@ def _changes(
     """Yield the best step and the drift of each subject over an order (m,) of the rows.
 
     Args:
-        rows: whitened.
-        residuals: (m, d) without a change.
-        subjects: what may have changed.
-        order: values that order the rows; equal ones stay together.
+        rows: the whitened rows.
+        residuals: (m, d) whitened residuals without a change.
+        subjects: the parts that may have changed.
+        order: (m,) values that order the rows; no step divides rows of equal value.
     """
     count = len(residuals)
     flat = rows.matrix.reshape(-1, rows.matrix.shape[2])
@@ -333,13 +342,19 @@ def _changes(
 
 
 def _sums_behind(terms: np.ndarray, rank: np.ndarray, cuts: np.ndarray) -> np.ndarray:
-    """Return the sums (c, …) of terms (m, …) of the rows behind each cut, in the order of `rank`."""
+    """Return the sums (c, …) of `terms` (m, …) over the rows behind each of c cuts.
+
+    Args:
+        terms: one array per row.
+        rank: (m,) row numbers in the order in which they are cut.
+        cuts: (c,) positions in that order.
+    """
     from_last = np.cumsum(terms[rank[::-1]], axis=0)
     return from_last[::-1][cuts]
 
 
 def _gains(score: np.ndarray, square: np.ndarray, shared: np.ndarray) -> np.ndarray:
-    """Return gᵀ S⁻¹ g (c,) of sums over rows: g (c, k), Σ HᵀH (c, k, k), Σ HᵀQ (c, k, f)."""
+    """Return the gains gᵀ S⁻¹ g (c,) of c changes from sums over rows: g (c, k), Σ HᵀH (c, k, k), Σ HᵀQ (c, k, f)."""
     prior = CHANGED**-2.0 * np.eye(score.shape[1])
     matrix = square - shared @ shared.transpose(0, 2, 1) + prior
     solution = np.linalg.solve(matrix, score[:, :, None])
@@ -347,7 +362,7 @@ def _gains(score: np.ndarray, square: np.ndarray, shared: np.ndarray) -> np.ndar
 
 
 def _gains_over_other_orders(rows: WhitenedRows, residuals: np.ndarray, subjects: Sequence[Subject]) -> Iterator[float]:
-    """Yield the gains of changes over joint values and the target's coordinates, which are not of time."""
+    """Yield the gains of changes over rows ordered by joint values and target coordinates instead of time."""
     measured = rows.block.measured
     assert isinstance(measured, Positions)
     for order in (*measured.q.T, *measured.position.T):
@@ -356,7 +371,7 @@ def _gains_over_other_orders(rows: WhitenedRows, residuals: np.ndarray, subjects
 
 
 def _holds_on_held_out(rows: WhitenedRows, change: RowChange) -> bool:
-    """Return whether the change explains rows that did not determine it."""
+    """Return whether the change also reduces the residuals of held-out rows."""
     changed = rows.with_columns(change.columns)
     count = len(rows.residual)
     squares = changed_squares = 0.0
@@ -369,13 +384,13 @@ def _holds_on_held_out(rows: WhitenedRows, change: RowChange) -> bool:
 
 
 def _squares_on(rows: WhitenedRows, held_out: np.ndarray, fitted: np.ndarray) -> float:
-    """Return the sum of squares of some rows with the estimate by others."""
+    """Return the sum of squares of the rows `held_out` with the estimate from the rows `fitted`."""
     residuals = rows.some(held_out).residuals(rows.some(fitted).solve())
     return float(np.sum(residuals**2))
 
 
 def _described(rows: WhitenedRows, change: RowChange) -> Finding:
-    """Return the finding on a change, with its size and σ."""
+    """Return the finding on a change, with the estimated size of the change and its σ."""
     extended = rows.with_columns(change.columns)
     estimate = extended.solve()
     count = change.subject.count

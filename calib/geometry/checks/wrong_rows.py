@@ -1,7 +1,7 @@
-"""Rows that are not what they are said to be: paired with joints of other rows, or measured on two targets.
+"""Rows that do not match their file: paired with the joint values of other rows, or measured on two targets.
 
-Both are judged by what an arm with any placements leaves at least. Positions y = B (R p + t) + b, with R, t the tip's
-by the joints and B, b, p the placements, are linear in B ⊗ p, B and b: 13 numbers per axis of y.
+Both are judged by the least error of the arm over all placements. Positions y = B (R p + t) + b, with R, t the tip's
+pose from the joints and B, b, p the placements, are linear in B ⊗ p, B and b: 13 numbers per axis of y.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ Blocks = Sequence[PoseMeasurements]
 
 
 def least_error(nominal: Installation, blocks: Blocks) -> np.ndarray:
-    """Return the least mean squared error [m²] (1,) that any base and tool placement can reach; 0 if not known."""
+    """Return the least mean squared error [m²] (1,) over all base and tool placements; 0 without enough positions."""
     squares = 0.0
     count = 0
     for block in blocks:
@@ -48,7 +48,7 @@ def least_error(nominal: Installation, blocks: Blocks) -> np.ndarray:
 
 
 def _columns(nominal: Installation, block: Positions) -> np.ndarray:
-    """Return the columns (m, 13) of R, t and 1 of a block's rows."""
+    """Return the columns (m, 13) of the linear position model for a block's rows: from R, t of the tip, and 1."""
     tip = forward(nominal.chain, block.q)
     rotation = tip[:, :3, :3].reshape(-1, 9)
     return np.column_stack([rotation, tip[:, :3, 3], np.ones(len(tip))])
@@ -60,12 +60,12 @@ def _unexplained(columns: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def row_shifts(nominal: Installation, blocks: Blocks, max_left: float) -> list[Change]:
-    """Return changes that pair measurements with the joints of rows further down or up, from the best row on.
+    """Return hypotheses that, from some row on, pair measurements with the joint values of rows further down or up.
 
     Args:
-        nominal: the arm.
-        blocks: the rows; row numbers that are missing were held out.
-        max_left: share of the error that such a change may leave.
+        nominal: the nominal arm.
+        blocks: the measurements; rows missing in their numbering were held out.
+        max_left: largest share of the error that may remain with such a shift.
     """
     changes = []
     for number, block in enumerate(blocks):
@@ -83,7 +83,7 @@ def row_shifts(nominal: Installation, blocks: Blocks, max_left: float) -> list[C
 
 
 def _best_first(nominal: Installation, block: Positions, shift: int) -> int | None:
-    """Return the number of the row from which on a shift explains most; None for too few rows."""
+    """Return the row from which on a shift by `shift` rows explains the positions best; None for too few rows."""
     numbers = np.unique(block.rows)[: -MIN_SHIFTED - abs(shift)]
     if len(numbers) < MIN_SHIFTED or len(_shifted(block, 0, shift)) < MIN_PAIRED * len(block):
         return None
@@ -98,14 +98,14 @@ def _best_first(nominal: Installation, block: Positions, shift: int) -> int | No
 
 
 def _shifted_block(number: int, first: int, shift: int, blocks: Blocks) -> Blocks:
-    """Return the blocks, one of them shifted."""
+    """Return the blocks with block `number` shifted (see `_shifted`)."""
     block = blocks[number]
     assert isinstance(block, Positions)
     return [*blocks[:number], _shifted(block, first, shift), *blocks[number + 1 :]]
 
 
 def _shifted(block: Positions, first: int, shift: int) -> Positions:
-    """Return a block whose rows from number `first` on have the joints of the row `shift` further down."""
+    """Return a block whose rows from number `first` on take their joint values from the row `shift` further down."""
     numbers, index = np.unique(block.rows, return_index=True)
     source = np.where(block.rows >= first, block.rows + shift, block.rows)
     position = np.minimum(np.searchsorted(numbers, source), len(numbers) - 1)
@@ -119,8 +119,8 @@ class Mixture:
 
     Attributes:
         second: (m,) whether a row was measured on the second target.
-        distance: of the targets [m].
-        squares: what remains [m²].
+        distance: distance between the two targets [m].
+        squares: sum of squared residuals after the fit with two targets [m²].
     """
 
     second: np.ndarray
@@ -129,12 +129,12 @@ class Mixture:
 
 
 def two_targets(nominal: Installation, blocks: Blocks, max_left: float) -> list[Change]:
-    """Return changes that divide the rows of one block among two targets.
+    """Return hypotheses that the rows of one block were measured on two targets.
 
     Args:
-        nominal: the arm.
-        blocks: the rows.
-        max_left: share of the error that such a change may leave.
+        nominal: the nominal arm.
+        blocks: the measurements.
+        max_left: largest share of the error that may remain with two targets.
     """
     changes = []
     for number, block in enumerate(blocks):
@@ -159,7 +159,7 @@ def two_targets(nominal: Installation, blocks: Blocks, max_left: float) -> list[
 
 
 def _divided(number: int, second: frozenset[int], blocks: Blocks) -> Blocks:
-    """Return the blocks, the rows `second` of one with a second target."""
+    """Return the blocks with the rows `second` of block `number` assigned to a second target."""
     block = blocks[number]
     tool = np.isin(block.rows, list(second)).astype(int)
     name = block.tool_names[0]
@@ -168,13 +168,14 @@ def _divided(number: int, second: frozenset[int], blocks: Blocks) -> Blocks:
 
 
 def _sorted_by_target(columns: np.ndarray, position: np.ndarray) -> Mixture:
-    """Return rows sorted by target: each row to the target that it fits, and the fit again, until no row changes.
+    """Return the rows sorted by target: assign each row to the target that fits it better, fit again, until none
+    changes.
 
-    It begins with the sign of the residuals, in the tip's frame, along their first principal axis.
+    The first assignment is the sign of the residuals, in the tip's frame, along their first principal axis.
 
     Args:
-        columns: (m, 13) of R, t and 1.
-        position: (m, 3) [m].
+        columns: (m, 13) columns of the linear position model, see `_columns`.
+        position: (m, 3) measured positions [m].
     """
     rotations = columns[:, :9].reshape(-1, 3, 3)
     base_transposed = np.linalg.lstsq(columns, position)[0][9:12]
@@ -188,7 +189,7 @@ def _sorted_by_target(columns: np.ndarray, position: np.ndarray) -> Mixture:
 
 
 def _settled(columns: np.ndarray, position: np.ndarray, second: np.ndarray) -> Mixture:
-    """Return the rows sorted by target from a first guess (m,)."""
+    """Return the rows sorted by target, starting from a first assignment `second` (m,)."""
     distance = 0.0
     squares = np.inf
     for _ in range(MAX_ROUNDS):

@@ -47,10 +47,11 @@ class LegLinks:
     """One leg at N postures.
 
     Attributes:
-        full: (N, 6, n) Jacobian of its end: velocity, angular velocity; jacobian: (N, c, n) the held part of it.
+        full: (N, 6, n) Jacobian of its end: velocity, angular velocity; jacobian: (N, c, n) its rows for the c closure
+            equations.
         inverse: (N, n, c) J⁺.
-        carried: (N, c, 6) G, velocity of its attachment by the platform's twist.
-        gap: (N, c) by which its end misses the attachment [m, rad].
+        carried: (N, c, 6) G, which maps the platform's twist to the attachment's velocity.
+        gap: (N, c) distance of the leg's end from the attachment [m, rad].
         lever: (N, 3) from the platform's origin to the attachment, in the base's axes.
     """
 
@@ -83,7 +84,7 @@ def pseudo_inverse(J: np.ndarray) -> np.ndarray:
 
 
 def times(A: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return A x sample by sample; A (N, k, l), x (N, l)."""
+    """Return the products A x (N, k) of matrices A (N, k, l) and vectors x (N, l), sample by sample."""
     return (A @ x[:, :, None])[:, :, 0]
 
 
@@ -136,11 +137,12 @@ class ClosedRobot:
     """A parallel robot whose loops close at home.
 
     Attributes:
-        robot: legs and platform.
-        home: its posture there, (1, ...).
-        minors: per leg, the rows of its Jacobian whose sign of the determinant is its branch.
-        signs: (L + 1,) of these determinants at home; last that of the encoders' rows (0 where they are redundant).
-        fixed: whether the loops leave the same twists everywhere: the named ones.
+        robot: the robot's legs and platform.
+        home: posture at home, with one sample.
+        minors: per leg, rows of its Jacobian; the sign of their determinant identifies the leg's branch.
+        signs: (L + 1,) signs of these determinants at home; last the sign for the encoders' rows (0 if they are
+            redundant).
+        fixed: whether the platform's possible twists are the named freedoms in the whole workspace.
     """
 
     robot: ParallelRobot
@@ -154,16 +156,19 @@ class ClosedRobot:
 
         Args:
             readings: (N, n) [rad or m]; a record, whose samples follow one another, is solved faster.
-            start: checked postures that are near, to start from: the new ones are not checked again; None: home.
+            start: nearby checked postures to start from, in which case the result is not checked again; None to start
+                from home.
 
         Raises:
-            NoPosture: for samples out of reach, beyond a singularity, or in one.
+            NoPosture: for samples out of reach, or at or beyond a singularity.
         """
         readings = shaped(readings, (None, self.robot.n), f"readings of '{self.robot.name}'")
         return _reached(self, readings, self.home.q[0, self.robot.actuated], _from_readings, start)
 
     def place(self, coordinates: np.ndarray, start: Posture | None = None) -> Posture:
-        """Return the postures at platform coordinates (N, r) [m, rad] relative to home; arguments: see `locate`."""
+        """Return the postures at platform coordinates (N, r) [m, rad] relative to home; arguments and errors as in
+        `locate`.
+        """
         coordinates = shaped(coordinates, (None, self.robot.r), f"platform coordinates of '{self.robot.name}'")
         return _reached(self, coordinates, np.zeros(self.robot.r), _from_coordinates, start)
 
@@ -172,10 +177,11 @@ _Aim = Callable[[ClosedRobot, Sequence[LegLinks], np.ndarray, np.ndarray, Postur
 
 
 def closed(robot: ParallelRobot) -> ClosedRobot:
-    """Return a robot with its loops closed at home; raise an error if its freedoms are not those named.
+    """Return a robot with its loops closed at home; checking that its freedoms are those named.
 
     Raises:
-        RobotError: where a loop does not close there, home is singular, or the loops leave other freedoms than named.
+        RobotError: if a loop does not close at home, home is singular, or the loops leave other freedoms than those
+            named.
     """
     home_q = np.concatenate([leg.home for leg in robot.legs])
     start = Posture(home_q[None], robot.home[None])
@@ -289,7 +295,7 @@ def _reading_rows(mechanism: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarr
 
 
 def _check_postures(mechanism: ClosedRobot, posture: Posture) -> None:
-    """Raise an error for postures at a singularity, or on another branch than home.
+    """Raise NoPosture for postures at a singularity, or on another branch than home.
 
     Raises:
         NoPosture: naming the sample, the leg or the platform, and the type: 1 (a leg is stretched or folded), 2 (the
@@ -377,7 +383,7 @@ def _newton(mechanism: ClosedRobot, start: Posture, goals: np.ndarray, aim: _Aim
 
 
 def _tell_unreached(mechanism: ClosedRobot, posture: Posture, unreached: np.ndarray) -> None:
-    """Raise an error for samples whose loops Newton's method does not close, with the likely reason."""
+    """Raise NoPosture for samples whose loops Newton's method does not close, with the likely reason."""
     first = posture[unreached[:1]]
     home = leg_links(mechanism.robot, mechanism.home)
     largest_gap, farthest_leg, weak_leg = -np.inf, "", ""

@@ -60,10 +60,10 @@ class LoopFit:
 
     Attributes:
         mechanism: the calibrated robot, its loops closed.
-        parameters: that may change; estimate: their changes from the nominal robot, with covariance.
-        vague: names of parameters of which the data identify less than half of what was known beforehand.
+        parameters: constants that may change; estimate: changes from the nominal robot, with covariance.
+        vague: names of parameters whose σ remains above half that of the prior.
         before, after: rms of the encoders' residuals [rad or m], nominal and calibrated.
-        iterations: of Gauss and Newton.
+        iterations: number of Gauss–Newton iterations.
     """
 
     mechanism: ClosedRobot
@@ -79,9 +79,9 @@ class LoopFit:
 class LoopCovariance:
     """Covariance (K, K) [m², rad²] of K constants of a parallel robot's loops, by name.
 
-    Constants that no relation of encoders and platform shows (where along its axis a planar leg lies, how the angle of
-    a passive joint is counted) are choices of frames, without uncertainty. Those that could be shown, but were not by
-    the poses of a fit, keep the uncertainty that was assumed before it.
+    Constants without effect on the relation of encoders and platform (position of a planar leg along its axis, zero of
+    a passive joint) are choices of frames, without uncertainty. Constants with an effect that the poses of a fit did
+    not identify keep the uncertainty assumed before the fit.
     """
 
     names: tuple[str, ...]
@@ -96,7 +96,7 @@ class LoopCovariance:
         return cls(names, frozen(across @ fit.estimate.covariance @ across))
 
     def of(self, mechanism: ClosedRobot) -> tuple[LoopParameter, ...]:
-        """Return the constants of a robot that the names are of.
+        """Return the constants of a robot that have the covariance's names.
 
         Raises:
             RobotError: for a name that none of its loops has.
@@ -136,17 +136,18 @@ def fit_loops(
     """Return the geometry of a parallel robot fitted to encoder readings, with or without platform coordinates.
 
     Args:
-        nominal: to start from.
+        nominal: the robot to start from.
         readings: (m, n) of the actuated joints [rad or m].
         coordinates: (m, r) measured platform coordinates from home [m, rad]; None: readings alone, of a robot with more
             encoders than freedoms.
         held: names of parameters that stay.
-        loss: relative change of the residuals' sum of squares at which the fit is settled.
+        loss: relative change of the residuals' sum of squares below which the fit has converged.
 
     Raises:
-        Unidentifiable: where the data identify no parameter; readings alone of a robot without redundancy.
+        Unidentifiable: if the data identify no parameter, or only readings are given for a robot without redundant
+            encoders.
         NoPosture: for rows at which no posture exists.
-        NotConverged: after 30 steps.
+        NotConverged: if the fit has not converged after 30 steps.
     """
     robot = nominal.robot
     if coordinates is None and not robot.redundant:
@@ -195,7 +196,7 @@ def fit_loops(
 def visible_directions(mechanism: ClosedRobot, parameters: Sequence[LoopParameter], postures: int = 100) -> np.ndarray:
     """Return orthonormal directions (p, k) of the constants that relate encoders to the platform somewhere in its box.
 
-    Across them, constants change without effect: they are choices of frames.
+    Changes of the constants orthogonal to these directions have no effect: they are choices of frames.
     """
     robot = mechanism.robot
     coordinates = np.random.default_rng(0).uniform(robot.lower, robot.upper, (postures, robot.r))

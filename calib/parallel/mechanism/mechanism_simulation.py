@@ -37,8 +37,8 @@ class ParallelPlant:
     """A parallel robot to simulate, in place of a serial arm's `calib.identification.closed_loop.simulation.Plant`.
 
     Attributes:
-        model: `ParallelModel` of the robot with its drive terms, which makes this robot; parameters (p,) of it.
-        carried: payloads on board; None: all.
+        model: `ParallelModel` of the robot with its drive terms; parameters: (p,) values of the model's parameters.
+        carried: payloads carried; None: all.
     """
 
     model: Any
@@ -47,7 +47,7 @@ class ParallelPlant:
 
     @property
     def terms(self) -> tuple[DriveTerm, ...]:
-        """Drive terms of the last parameters."""
+        """Drive terms, whose parameters are the last ones of the model."""
         return self.model.columns
 
     def with_parameters(self, parameters: np.ndarray) -> ParallelPlant:
@@ -63,7 +63,7 @@ class ParallelPlant:
         return self.model.joint_noise(noise)
 
     def inertia_diagonal(self, q: np.ndarray) -> np.ndarray:
-        """Refuse gains that follow an inertia: redundant actuators have none of their own."""
+        """Raise an error: gains proportional to inertia are not supported for parallel robots."""
         raise UsageError("[loop] design is for serial arms only; state the gains as they are")
 
     def feed_forward(self, reference: Reference) -> np.ndarray:
@@ -86,7 +86,7 @@ class ParallelPlant:
             mixing: (N, n, n) by which the feedback of all actuators is multiplied: a controller in other coordinates.
 
         Raises:
-            NotConverged: where the loop is unstable; `CannotSimulate` for an inertia that is not positive definite.
+            NotConverged: if the loop is unstable; `CannotSimulate` for an inertia matrix that is not positive definite.
         """
         from calib.parallel.mechanism import simulation_kernels
 

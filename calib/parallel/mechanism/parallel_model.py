@@ -97,11 +97,11 @@ class ParallelModel:
 
     Attributes:
         mechanism: the robot, its loops closed.
-        terms: the drives' terms; their joints are those of the tree.
+        terms: drive terms; their joint indices refer to the tree.
         torque_rows: ``platform``, ``motor`` or ``power`` rows (`rows_named`).
         payloads: labels of bodies that the platform may carry.
-        identical_legs: whether the legs' bodies and motor inertias are alike: one set of parameters, under the first
-            leg's names. Friction and offsets stay each joint's own.
+        identical_legs: whether all legs have common inertial parameters and motor inertias, named after the first leg.
+            Friction and offsets differ by joint.
         preload: (n - r,) mean overconstraint of redundant actuators (`velocities.overconstraint`) [N m or N]; (): 0.
     """
 
@@ -147,7 +147,9 @@ class ParallelModel:
 
     @cached_property
     def _first(self) -> np.ndarray:
-        """For each parameter of `single` (p_1,), which of them stands for it: itself, or the first leg's."""
+        """For each parameter of `single` (p_1,), the index of the parameter that represents it: itself, or the first
+        leg's.
+        """
         first = np.arange(self._bodies + len(self.terms))
         if self.identical_legs:
             size = self.legs[0][2].stop
@@ -163,20 +165,20 @@ class ParallelModel:
 
     @cached_property
     def _kept(self) -> np.ndarray:
-        """Which parameters of `single` stand for those here (p,)."""
+        """Indices (p,) in `single` of the parameters of this model."""
         return np.unique(self._first)
 
     @cached_property
     def owners(self) -> np.ndarray:
-        """For each parameter of `single` (p_1,), the index of the one that it is here."""
+        """For each parameter of `single` (p_1,), the index of the corresponding parameter in this model."""
         return np.unique(self._first, return_inverse=True)[1]
 
     def spread(self, values: np.ndarray) -> np.ndarray:
-        """Return the parameters of `single` (p_1,) from those here (p,)."""
+        """Return the parameters of `single` (p_1,) from the parameters (p,) of this model."""
         return np.asarray(values, dtype=float)[self.owners]
 
     def _merged(self, columns: np.ndarray) -> np.ndarray:
-        """Return columns (p, …) of the parameters from those of `single` (p_1, …)."""
+        """Return the columns (p, …) of this model's parameters from those of `single` (p_1, …)."""
         if not self.identical_legs:
             return columns
         result = np.zeros((self.p, *columns.shape[1:]))
@@ -375,7 +377,8 @@ class ParallelModel:
     def preference(self) -> np.ndarray:
         """Return the columns in the order of selection: platform, first moments, inertias, drives, masses, payloads.
 
-        Of bodies next to the platform, inertia and mass regroup on it and on the links before (Khalil & Ibrahim 2007).
+        Inertia and mass of bodies next to the platform regroup on the platform and on the links before (Khalil &
+        Ibrahim 2007).
         """
         orders = []
         leg_kinds = []
@@ -438,7 +441,6 @@ class ParallelModel:
 
     def known_parameters(self) -> np.ndarray | None:
         """Return the inertial parameters of the robot's file (inertial,), zero for payloads; None if it has none.
-
         Identical legs have the mean of the file's.
         """
         robot = self.mechanism.robot
@@ -574,7 +576,7 @@ def _moving(mechanism: ClosedRobot, *motion: bytes) -> LoopMotion:
 
 @lru_cache(maxsize=4)
 def _beside(mechanism: ClosedRobot, *motion: bytes) -> list[tuple[LoopMotion, LoopMotion]]:
-    """Return the motions of all joints beside x, v, a (N, r): each of their columns raised and lowered by its step."""
+    """Return the motions for finite differences at x, v, a (N, r): each column increased and decreased by its step."""
     states = [np.frombuffer(series).reshape(-1, mechanism.robot.r) for series in motion]
     result = []
     start = _moving(mechanism, *motion).posture
@@ -598,8 +600,8 @@ class PlatformRegressor:
     """Regressor in platform coordinates and actuator torques as functions of x, v, a; gradients are by differences.
 
     Attributes:
-        model: of the robot.
-        columns: (b,) of the model's that count.
+        model: model of the robot.
+        columns: (b,) indices of the model's columns that are used.
         values: (p,) parameters that predict torques; None where unknown.
     """
 
@@ -635,7 +637,7 @@ class PlatformRegressor:
     def _reachable(self, x: np.ndarray, spare_share: float = 0.01) -> np.ndarray:
         """Return coordinates clipped to the robot's box, since a search may leave the box.
 
-        `spare_share`: of the box's width, beyond it (our choice).
+        `spare_share`: share of the box's width allowed beyond the box (our choice).
         """
         robot = self.model.mechanism.robot
         spare = spare_share * (robot.upper - robot.lower)
@@ -651,7 +653,7 @@ class PlatformRegressor:
         """Return the gradients of Σ weights · of(motion) in x, v, a by central differences (exact in v, a).
 
         Args:
-            of: the motion of N samples -> values (N, ...); weights: of the same shape.
+            of: maps a motion of N samples to values (N, ...); weights: array of the shape of these values.
         """
         within = self._reachable(x)
         result = np.empty((3, *x.shape))

@@ -59,7 +59,7 @@ class Leg(Frozen):
         chain: its joints, from the robot's base to its end; the first element holds its place in the base.
         actuated: which of its joints have a motor and an encoder.
         home: (n,) joint values near those that close its loop at the platform's home: they choose the branch.
-        attachment: (4, 4) where the platform holds its end, in the platform's frame.
+        attachment: (4, 4) pose at which the platform holds the leg's end, in the platform's frame.
         end: ``rigid``: the last link is the platform, all passive joints are in the chain; ``spherical``: a joint of
             three freedoms ends it, which the chain leaves out.
     """
@@ -152,7 +152,7 @@ class ParallelRobot(Frozen):
             )
 
     def refuse(self, message: str) -> NoReturn:
-        """Refuse the robot for the reason `words`."""
+        """Raise RobotError about the robot, with the given message."""
         refuse_robot(f"robot '{self.name}'", message)
 
     @property

@@ -19,7 +19,7 @@ class LoopJacobians:
 
     Attributes:
         joints: (N, n_t, r) J_t: rates of all joints of the tree.
-        readings: (N, n, r) J_p^inv: those of the actuated ones.
+        readings: (N, n, r) J_p^inv: rates of the actuated joints.
         platform: (N, 6, r) D: the whole twist, in the base's axes.
         links: the legs.
     """
@@ -35,8 +35,8 @@ class LoopMotion:
     """Velocities and accelerations of N postures.
 
     Attributes:
-        posture: of joints and platform.
-        jacobians: there.
+        posture: postures of joints and platform.
+        jacobians: Jacobians at the postures.
         v, a: (N, n_t) of all joints of the tree [per s, per s²].
         twist, change: (N, 6) of the platform: velocity of its origin, angular velocity, and their derivatives.
         rate: (N, r) the independent parts of the twist.
@@ -69,8 +69,8 @@ def of_platform(
     """Return velocities and accelerations at postures from those of the platform.
 
     Args:
-        rate, change: (N, r) independent parts of its twist, and their derivatives.
-        jacobians: of the postures, where they are known already.
+        rate, change: (N, r) independent parts of the platform's twist, and their derivatives.
+        jacobians: Jacobians at the postures; None to compute them.
     """
     loop = jacobians or loop_jacobians(mechanism, posture)
     v = np.einsum("ntr,nr->nt", loop.joints, rate)
@@ -90,10 +90,10 @@ def of_platform(
 def of_readings(mechanism: ClosedRobot, posture: Posture, v: np.ndarray, a: np.ndarray) -> LoopMotion:
     """Return velocities and accelerations at postures from those of the encoders (eqs 16, 18).
 
-    All joints and the platform; with redundant encoders, by least squares.
+    The result covers all joints and the platform; redundant encoders are combined by least squares.
 
     Args:
-        v, a: (N, n) of the actuated joints.
+        v, a: (N, n) velocities and accelerations of the actuated joints.
     """
     loop = loop_jacobians(mechanism, posture)
     if mechanism.robot.redundant:
@@ -157,7 +157,7 @@ def preload_directions(mechanism: ClosedRobot, jacobians: LoopJacobians) -> np.n
 
 
 def overconstraint(mechanism: ClosedRobot, jacobians: LoopJacobians, torques: np.ndarray) -> np.ndarray:
-    """Return c (N, n - r) [N m or N] of actuator torques (N, n): their part that does no work."""
+    """Return the overconstraint c (N, n - r) [N m or N] of actuator torques (N, n): the part that does no work."""
     torques = shaped(torques, (len(jacobians.readings), mechanism.robot.n), "torques of the actuators")
     return np.einsum("nac,na->nc", preload_directions(mechanism, jacobians), torques)
 

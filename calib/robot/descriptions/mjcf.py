@@ -32,7 +32,7 @@ def convert(path: str) -> str:
     """Return the URDF text of an MJCF file; an ``.xml`` file that is a URDF already comes back unchanged.
 
     Raises:
-        RobotError: where MuJoCo is missing or cannot read it, or for what is no serial arm.
+        RobotError: if MuJoCo is missing or cannot read the file, or the model is no serial arm.
     """
     text = Path(path).read_text(encoding="utf-8", errors="replace")
     if "<robot" in text and "<mujoco" not in text.partition("<robot")[0]:
@@ -51,7 +51,7 @@ def convert(path: str) -> str:
 
 
 def _compiled(spec: NativeModel) -> NativeModel:
-    """Return the model without meshes and pictures, whose files need not be there where masses are stated."""
+    """Return the model without meshes and pictures, whose files are not needed where masses are stated."""
     try:
         return spec.compile()
     except ValueError as error:
@@ -96,7 +96,7 @@ class _Tree:
         """Add a body's joints, in the order in which MuJoCo moves them, and its link, whose frame is the body's.
 
         With several joints: T = T_body · Π Trans(pos) exp(axis (q - ref)) Trans(-pos) (MuJoCo documentation,
-        "Computation", kinematic tree); a link without mass stands behind each but the last.
+        "Computation", kinematic tree); each joint but the last is followed by a link without mass.
         """
         model, name = self.model, self.bodies[k]
         parent, placed = self.bodies[model.body_parentid[k]], _pose(model.body_pos[k], model.body_quat[k])
@@ -166,7 +166,7 @@ class _Tree:
         return efforts
 
     def _leaders(self) -> dict[int, dict[str, str]]:
-        """Return the <mimic> of each joint that an equality ties to another; refuse what closes a loop."""
+        """Return the <mimic> of each joint that an equality ties to another; refuse equalities that close a loop."""
         model = self.model
         mimics: dict[int, dict[str, str]] = {}
         tied: set[int] = set()

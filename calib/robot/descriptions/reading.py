@@ -1,4 +1,4 @@
-"""Files that are converted to a URDF when they are read, by their ending."""
+"""Readers of files that are converted to a URDF when read, chosen by their suffix."""
 
 from functools import lru_cache
 from pathlib import Path
@@ -18,7 +18,7 @@ def urdf(path: str) -> str:
     """Return the URDF text of a file, or of a xacro file with its arguments.
 
     Raises:
-        RobotError: saying what was found, where, and what to try.
+        RobotError: for a file that cannot be converted.
     """
     return _converted(path, Path(xacro_files.split(path)[0]).stat().st_mtime_ns)
 

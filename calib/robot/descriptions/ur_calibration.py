@@ -41,10 +41,10 @@ FARTHEST = 0.03  # [m] of a joint's axis from the nominal place of its joint: no
 
 
 def convert(path: str) -> str:
-    """Return the URDF text of a ``calibration.conf``, the type of its arm behind it.
+    """Return the URDF text of ``calibration.conf ur_type:=TYPE``, the file's path followed by the arm's type.
 
     Raises:
-        RobotError: for a file that is none, without a type, or with one that cannot be the file's.
+        RobotError: for an invalid file, a missing type, or a type that contradicts the file.
     """
     file, arguments = split(path)
     table = tomllib.loads(shipped_text("calib.robot.descriptions", "universal_robots.toml"))
@@ -82,7 +82,7 @@ def _nominal(a: list[float], d: list[float]) -> np.ndarray:
 
 
 def _deltas(path: str) -> np.ndarray:
-    """Return the deltas (6, 4) of θ, a, d, α in a file."""
+    """Return the corrections (6, 4) to θ, a, d, α in a file [rad, m]."""
     with refused_as(RobotError, (OSError, UnicodeDecodeError), f"{path}: cannot be read: {{}}"):
         content = Path(path).read_text(encoding="utf-8")
     rows = []
@@ -107,7 +107,7 @@ def _frames(table: np.ndarray) -> np.ndarray:
 
 
 def _beside(axis: np.ndarray, nominal: np.ndarray) -> np.ndarray:
-    """Return the frame (4, 4) on an axis, the z of the first frame, that is next to the second."""
+    """Return the frame (4, 4) whose z is the axis of frame `axis`, at that axis's point nearest to frame `nominal`."""
     z, start = axis[:3, 2], axis[:3, 3]
     position = start + z * (z @ (nominal[:3, 3] - start))
     x = nominal[:3, 0] - z * (z @ nominal[:3, 0])

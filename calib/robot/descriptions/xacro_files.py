@@ -50,7 +50,7 @@ def split(path: str) -> tuple[str, dict[str, str]]:
 
 
 class _Arguments(dict[str, str]):
-    """Arguments that know which of them were declared: xacro ignores others without a word."""
+    """Arguments that record which of them the file declares, since xacro silently ignores unknown ones."""
 
     def __init__(self, arguments: dict[str, str]) -> None:
         super().__init__(arguments)
@@ -66,10 +66,11 @@ class _Arguments(dict[str, str]):
 
 
 def expand(path: str) -> str:
-    """Return the URDF text of a xacro file, its arguments behind it.
+    """Return the URDF text of a xacro file, whose path may be followed by arguments (``name:=value``).
 
     Raises:
-        RobotError: naming the file in which xacro failed, and what it says; for an argument that it does not have.
+        RobotError: if xacro fails (the message names the file and xacro's error), or for an argument that the file does
+            not declare.
     """
     xacro = import_module("xacro")
 
@@ -122,7 +123,7 @@ def package_folder(name: str, file: Path) -> Path:
     """Return the folder of a ROS package that a robot's file names.
 
     Raises:
-        RobotError: saying how to give its folder.
+        RobotError: if the package is not found.
     """
     parents = file.resolve().parents
     packages = map(_packages_in, (*parents[:MAX_ABOVE], *package_folders()))

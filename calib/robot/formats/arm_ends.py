@@ -43,8 +43,8 @@ class ArmEnds:
     """Base and tip links of an arm, and how they were chosen.
 
     Attributes:
-        base, tip: links.
-        reason: why the tip was taken, as words that follow its name.
+        base, tip: names of the two links.
+        reason: reason for the choice of the tip, as words that follow its name.
         unused: remarks on joints that are not in the arm, columns that are not used, frames that are not taken.
     """
 
@@ -55,7 +55,7 @@ class ArmEnds:
 
     @property
     def words(self) -> str:
-        """The tip and why it was taken; what is not part of the arm."""
+        """The tip, the reason for its choice, and the remarks on what is not part of the arm, as text."""
         return "; ".join([f"{self.tip}, {self.reason}", *self.unused])
 
 
@@ -63,12 +63,12 @@ def choose(tree: UrdfTree, base: str, joint_names: Sequence[str] | None = None) 
     """Return the ends of the arm that begins at `base`.
 
     Args:
-        tree: a checked URDF.
-        base: a link.
-        joint_names: the joints that a table has columns for; the arm ends with the last of them. Jaws do not count.
+        tree: the checked tree of a URDF.
+        base: name of the arm's base link.
+        joint_names: joints that have columns in a table; the arm ends with the last of them, gripper jaws excepted.
 
     Raises:
-        RobotError: where the choice is not clear, listing the candidates.
+        RobotError: if the choice is ambiguous; the message lists the candidates.
     """
     axes = _Axes(tree, base)
     ends = axes.chains if joint_names is None else axes.named(joint_names)
@@ -83,7 +83,7 @@ def choose(tree: UrdfTree, base: str, joint_names: Sequence[str] | None = None) 
 
 
 class _Axes:
-    """The axes of the arms that a tree holds below a link, and the joints that are none.
+    """The joints below a link of a tree, divided into axes of arms and joints that are no axes (jaws, fingers).
 
     Attributes:
         aside: actuated joints that are no axes, by name, each with the reason.
@@ -106,11 +106,11 @@ class _Axes:
         self.chains = self._rivals(self._last_bodies())
 
     def depth(self, link: str) -> int:
-        """Return how many actuated joints stand between the base and a link."""
+        """Return the number of actuated joints between the base and a link."""
         return sum(joint.actuated for joint in self.tree.path(self.base, link))
 
     def height(self, joint: JointTag) -> int:
-        """Return the number of axes on the longest chain that begins with a joint; 0 if it is none itself."""
+        """Return the number of axes on the longest chain that begins with a joint; 0 if the joint is no axis."""
         if joint.name in self.aside:
             return 0
         behind = [self.height(child) for child in self.tree.below[joint.child]]
@@ -127,7 +127,7 @@ class _Axes:
         """Return the last bodies of the chains that hold the named joints, jaws left out where any joint remains.
 
         Raises:
-            RobotError: for a joint that does not exist.
+            RobotError: for the name of a joint that does not exist.
         """
         joints = self.tree.joints
         for name in joint_names:
@@ -185,13 +185,13 @@ class _Axes:
         return _leaves(self.tree, last)
 
     def _is_driven(self, body: str) -> bool:
-        """Return whether a body is moved by a joint of its own, or follows the joint before it in the chain."""
+        """Return whether a body's joint is actuated, or a mimic of the joint before it in the chain."""
         joint = self.tree.above[body]
         leader = self.tree.joints.get(joint.mimic.leader) if joint.mimic else None
         return joint.actuated or (leader is not None and _hangs(self.tree, body, leader.child))
 
     def _rivals(self, bodies: list[str]) -> list[str]:
-        """Return of several last bodies those of the longest chain and of other arms."""
+        """Return those of several last bodies that end the longest chain or another arm."""
         depth = max(self.depth(body) for body in bodies)
         longest = [body for body in bodies if self.depth(body) == depth]
         shorter = [body for body in bodies if body not in longest]
@@ -199,7 +199,7 @@ class _Axes:
         return [*longest, *arms]
 
     def _is_another_arm(self, body: str, main: str) -> bool:
-        """Return whether a chain has nearly as many axes as the longest one behind the link at which they part."""
+        """Return whether, behind the link where both part, a chain has nearly as many axes as the longest chain."""
         path = self.tree.path(self.base, body)
         main_path = self.tree.path(self.base, main)
         shared = sum(joint.actuated for joint, main_joint in zip(path, main_path) if joint.name == main_joint.name)
@@ -237,11 +237,11 @@ class _Axes:
         return result
 
     def _depth_in_tree(self, joint: JointTag) -> int:
-        """Return how many joints stand between the root and a joint's child."""
+        """Return the number of joints between the root and a joint's child link."""
         return len(self.tree.ancestry(joint.child))
 
     def _is_jaw(self, joint: JointTag) -> bool:
-        """Return whether a joint's name, or its link's, is that of a jaw; a word that the whole arm has is a prefix."""
+        """Return whether a joint's or its link's name is that of a jaw; words common to the whole arm are ignored."""
         first = self._first(joint.child)
         name, link = joint.name.lower(), joint.child.lower()
         if name == first or self._is_named_axis(joint):
@@ -251,7 +251,9 @@ class _Axes:
         return not self._in_series(joint) and any(word in link and word not in first for word in FINGER_WORDS)
 
     def _behind_flange(self) -> dict[str, str]:
-        """Return the joints behind bodies with a tool0 or a flange, where what is behind them is no arm."""
+        """Return the joints behind bodies with a tool0 or a flange, if those joints belong to a tool; each with the
+        reason.
+        """
         result: dict[str, str] = {}
         for body in self._bodies():
             frames = [link for link, _ in self.tree.rigid(body) if TOOL0.search(link) or FLANGE.search(link)]
@@ -270,7 +272,7 @@ class _Axes:
         return max(heights) < self.depth(body) and (single or self._is_hand(body, branches))
 
     def _beside_axis(self) -> dict[str, str]:
-        """Return short branches beside the only one that continues the arm: by its name, or up to a flange."""
+        """Return the joints of short branches beside the branch that continues the arm (by name, or up to a flange)."""
         result: dict[str, str] = {}
         for body in self._bodies():
             branches = [joint for joint in self.departing(body) if self.height(joint)]
@@ -328,7 +330,9 @@ class _Axes:
         return [joint.name, *behind]
 
     def _first(self, link: str) -> str:
-        """Return the name of the first actuated joint before a link, in small letters: its words may be a prefix."""
+        """Return the name of the first actuated joint before a link, in lower case; its words may be a prefix of all
+        names.
+        """
         return next(joint.name.lower() for joint in self.tree.ancestry(link) if joint.actuated)
 
     def _is_named_axis(self, joint: JointTag) -> bool:
@@ -374,7 +378,7 @@ def _frame(tree: UrdfTree, body: str) -> tuple[str, str]:
 
 
 def _without_tools(tree: UrdfTree, body: str) -> list[str]:
-    """Return the links fixed to a body, its own first, without grippers and sensors and what is fixed to them."""
+    """Return the links fixed to a body, the body's main link first, without grippers, sensors and links on these."""
     prefix = body.lower()
     result: list[str] = []
     todo = [body]
@@ -393,7 +397,7 @@ def _without_tools(tree: UrdfTree, body: str) -> list[str]:
 
 
 def _leaves(tree: UrdfTree, links: Iterable[str]) -> list[str]:
-    """Return those of some links that no other of them hangs on."""
+    """Return those of `links` that have no child among `links`."""
     links = list(links)
     before: set[str] = set()
     for link in links:

@@ -87,11 +87,11 @@ def tip_poses(source: str, chain: Chain, q: np.ndarray) -> np.ndarray:
 
     Args:
         source: URDF text.
-        chain: read from it by `calib.robot.formats.urdf`, whose joints, base and tip q belongs to.
-        q: (m, n) [rad or m].
+        chain: the chain read from the text by `calib.robot.formats.urdf`; its joints are the columns of q.
+        q: (m, n) joint values [rad or m].
 
     Raises:
-        RobotError: where Pinocchio cannot read the text.
+        RobotError: if Pinocchio cannot read the text.
     """
     pin = import_module("pinocchio")
     model = pinocchio_model(source)
@@ -139,7 +139,7 @@ def motion_torques(
 
     Args:
         source: URDF or MJCF text.
-        chain: whose joints, gravity (in the root's frame) and mimic ratios count; other joints stand still at zero.
+        chain: supplies joints, gravity (in the root's frame) and mimic ratios; other joints are fixed at zero.
         q, v, a: (m, n) [rad or m, and per s, per s²].
         mjcf: whether it is MJCF, where the frames at q = 0 hold the chain's constant values.
 
@@ -148,7 +148,7 @@ def motion_torques(
         damping and friction (n,).
 
     Raises:
-        RobotError: where Pinocchio cannot read the text.
+        RobotError: if Pinocchio cannot read the text.
     """
     pin = import_module("pinocchio")
     model = pinocchio_model(source, mjcf)
@@ -188,12 +188,12 @@ def link_poses(source: str, links: Sequence[str], base: str, joints: Sequence[st
     """Return the poses (links, m, 4, 4) of links in the link `base` that yourdfpy computes from a URDF text.
 
     Args:
-        source: URDF text; meshes are not looked for.
+        source: URDF text; meshes are ignored.
         links, base: names of links.
-        joints: names of the joints that q (m, n) belongs to [rad or m]; others stand at zero, followers follow.
+        joints: names of the joints that q (m, n) belongs to [rad or m]; others are zero, mimic followers follow.
 
     Raises:
-        RobotError: where yourdfpy cannot read the text.
+        RobotError: if yourdfpy cannot read the text.
     """
     import yourdfpy  # and trimesh with it: a second to load
 

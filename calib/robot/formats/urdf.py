@@ -40,10 +40,10 @@ def read(
         path: the file.
         base: a link; default the root.
         tip: a link; default see `calib.robot.formats.arm_ends`.
-        joint_names: the joints a measurement file names; the chain holds no others.
+        joint_names: joints named in a measurement file; a chain with other joints is refused.
 
     Raises:
-        RobotError: saying what was found, where, and what to try.
+        RobotError: for an invalid URDF, or if the chain is ambiguous or no serial arm.
     """
     return parse(text(path)[0], str(path), base, tip, joint_names)
 
@@ -68,7 +68,7 @@ def ends(
     The base defaults to the root.
 
     Raises:
-        RobotError: where the choice is not clear, listing the candidates.
+        RobotError: if the choice is ambiguous; the message lists the candidates.
     """
     if base is None:
         if len(tree.roots) > 1:
@@ -127,7 +127,7 @@ def _unused_faults(tree: UrdfTree, path: list[JointTag]) -> list[str]:
 
 
 def align(axis: np.ndarray) -> np.ndarray:
-    """Return the rotation (4, 4) that aligns an elementary axis with a unit axis: identity for ±x ±y ±z, else z.
+    """Return the rotation (4, 4) that turns z onto a unit axis (3,); the identity for ±x ±y ±z.
 
     The columns x and y are any two that complete z (our choice: from the coordinate axis farthest from it).
     """
@@ -209,7 +209,7 @@ def _check_path(tree: UrdfTree, path: list[JointTag], base: str, tip: str, joint
 def _inertias(tree: UrdfTree, path: list[JointTag]) -> np.ndarray | None:
     """Return standard parameters (n, 10) about the frames after the moving elements; None without masses.
 
-    Also None where the body behind a mimic follower has mass: it would need a row of its own.
+    Also None where the body behind a mimic follower has mass, since there is one row per joint only.
     """
     rows = []
     for joint in path:

@@ -83,7 +83,7 @@ def text(path: str | Path) -> tuple[str, str]:
     """Return a URDF's text with unchanged line ends, and its declared encoding (default UTF-8); converted if need be.
 
     Raises:
-        RobotError: where it cannot be read, decoded or converted.
+        RobotError: if the file cannot be read, decoded or converted.
     """
     room = converter(path)
     if room is not None:
@@ -109,7 +109,7 @@ def parse(source: str, where: str) -> Node:
     """Return the root element of an XML text.
 
     Raises:
-        RobotError: where it is not well-formed, with the line and column.
+        RobotError: if the text is not well-formed; with line and column.
     """
     parser = expat.ParserCreate()
     root: list[Node] = []
@@ -217,7 +217,7 @@ class Mimic:
 class JointTag:
     """Joint of a URDF: origin (4, 4) in its parent link, unit axis (3,) in its frame, limits as in `_limits`.
 
-    `fault` says what is wrong with the limits: an error only where the joint is part of the arm.
+    `fault` describes an error in the limits, which is raised only if the joint is part of the arm.
     """
 
     name: str
@@ -259,7 +259,7 @@ class UrdfTree:
         joints: by name, in the order of the file.
         above: link name to its parent joint.
         below: link name to its child joints.
-        remarks: suspicious values.
+        remarks: remarks on suspicious values.
     """
 
     name: str
@@ -468,8 +468,8 @@ def _mimic(node: Node, where: str) -> Mimic | None:
 def _limits(node: Node, kind: str, where: str) -> tuple[float, float, float, float, tuple[str, ...]]:
     """Return a joint's limits (lower, upper, velocity, effort), and as text those below `MIN_LIMIT`.
 
-    Infinite where not given or beyond 1e9, the last two also below `MIN_LIMIT`: URDF demands velocity and effort, so 0
-    is what people write who do not know them, and 1e9 is what we write.
+    Infinite where not given or beyond 1e9, the last two also below `MIN_LIMIT`: URDF requires velocity and effort;
+    files state 0, and this toolkit 1e9, for unknown ones.
     """
     lower, upper, velocity, effort = -np.inf, np.inf, np.inf, np.inf
     tag = node.first("limit")

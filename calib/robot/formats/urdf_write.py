@@ -60,8 +60,8 @@ def put(
 
     Args:
         source: the text of a URDF.
-        where: names it in messages.
-        bodies: link name to standard parameters (10,) about the link's frame; all zero for none.
+        where: name of the URDF in messages.
+        bodies: link name to standard parameters (10,) about the link's frame; all zero to remove the inertial.
         friction: joint name to damping [N m s/rad or N s/m] and friction [N m or N].
     """
     root = parse(source, where)
@@ -82,7 +82,7 @@ def put(
 def hanging(tree: UrdfTree, path: list[JointTag], link: str) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Return the links that move with a link of a path: links fixed to it, and links after other joints (at zero).
 
-    Each by name with its pose (4, 4) in the frame of `link`, which is among the first.
+    Each is a map from a link's name to its pose (4, 4) in the frame of `link`; `link` is in the first map.
     """
     onward = {joint.name for joint in path}
     fixed = dict(tree.rigid(link))
@@ -152,11 +152,11 @@ def edit(source: str, nominal: Chain, calibrated: Chain, where: str = "URDF") ->
         source: the text of a URDF that describes the nominal robot.
         nominal: the chain before calibration; read from this URDF, or an MDH table of the same robot.
         calibrated: the same chain with other values.
-        where: names the text in messages.
+        where: name of the text in messages.
 
     Raises:
-        RobotError: where the URDF does not describe the nominal robot (naming the joint and the difference), or where
-            the calibrated chain is not the nominal one with other values.
+        RobotError: if the URDF does not describe the nominal robot (naming joint and difference), or if the calibrated
+            chain differs from the nominal one in more than values.
     """
     _check_pair(nominal, calibrated)
     tree = read_tree(source, where)
@@ -187,7 +187,8 @@ def write_new(chain: Chain) -> str:
     """Return a new URDF text of a chain, with a link frame after each moving element.
 
     Constant elements are folded into the joint origins. Limits are kept; where velocity or effort is not known 1e9
-    stands, since URDF demands a number. A body of unknown inertia has none. Pinocchio reads the same kinematics.
+    stands, since URDF demands a number. A body of unknown inertia gets no inertial. Pinocchio reads the same
+    kinematics.
     """
     root = ET.Element("robot", name=chain.name)
     ET.SubElement(root, "link", name=chain.base)
@@ -229,7 +230,7 @@ def _link_frames(tree: UrdfTree, path: Sequence[JointTag], chain: Chain, q: np.n
 
     Args:
         path: joints base to tip.
-        chain: whose joints, in the order of the actuated ones of the path, q belongs to.
+        chain: the chain whose joints, in the order of the path's actuated ones, are the columns of q.
         q: (m, n) [rad or m].
     """
     index: dict[str, int] = {}
@@ -307,7 +308,8 @@ def _base_offset(
 ) -> np.ndarray:
     """Return the pose (4, 4) of the path's first link in the chain's base; refuse a URDF of another robot.
 
-    The chain's base is the link of that name where there is one; else whichever link fixed to the foot fits best.
+    The chain's base is the URDF's link of this name if it exists, else the best-fitting link among those fixed to the
+    root.
     """
     foot = path[0].parent
     top = foot

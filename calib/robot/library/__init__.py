@@ -1,4 +1,4 @@
-"""Robots by what a user names: one of the library (a TOML file each), a file, or a folder with a ``robot.toml``."""
+"""Robots by name: of the library (one TOML file per robot), of a file, or of a folder with ``robot.toml``."""
 
 import logging
 from collections.abc import Sequence
@@ -31,16 +31,17 @@ def path(name: str) -> Path:
 def load(
     robot: str | Path, base: str | None = None, tip: str | None = None, joint_names: Sequence[str] | None = None
 ) -> Chain:
-    """Return the chain of a robot given by name or path; the log says where a URDF's arm ends, and why.
+    """Return the chain of a robot given by name or path; the log states where a URDF's arm ends, and why.
 
     Args:
         robot: a library name, the path of a ``.urdf``, ``.urdf.xacro``, MJCF or ``.toml`` file, or a folder that holds
             ``robot.toml``.
         base, tip: links of a URDF between which the arm runs.
-        joint_names: the joints a measurement file names (URDF).
+        joint_names: joints named in a measurement file, which select the chain of a URDF; None to select it from the
+            tree.
 
     Raises:
-        RobotError: where nothing of this kind is found, with the library's names and the nearest one.
+        RobotError: if no such robot is found; the message lists the library's names and the most similar one.
     """
     path = resolve(robot)
     if is_urdf(path):
