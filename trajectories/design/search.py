@@ -1,7 +1,7 @@
 """One start's search: sequential quadratic programming on the smoothed problem, sharper from stage to stage.
 
-The first stage looks at half of the samples, and at motions of few harmonics where the problem names a coarser family:
-most of the way costs a fraction there. The best motion that kept all constraints at the samples is returned, not the
+The first stage uses half of the samples and, where the problem names a coarser family, motions of few harmonics: most
+progress costs a fraction in this way. The result is the best motion that kept all constraints at the samples, not the
 last one.
 """
 
@@ -24,9 +24,15 @@ Method = Literal["slsqp", "auglag", "mma", "ccsaq"]
 
 
 class Stage(NamedTuple):
-    """Stage of a search: sharpness p of spectra and ρ of constraints, SLSQP's tolerance, share of evaluations.
+    """Stage of a search.
 
-    Rough: at half of the samples; coarse: in the coarse family.
+    Attributes:
+        spectra: sharpness p of the spectra.
+        constraints: sharpness ρ of the constraints.
+        tolerance: SLSQP's tolerance.
+        share: share of the evaluations.
+        rough: half of the samples are used.
+        coarse: the coarse family is used.
     """
 
     spectra: float
@@ -61,15 +67,17 @@ class SearchResult:
     """Result of a search.
 
     Attributes:
-        x: variables of the family; `factor` multiplies its period.
+        x: (p,) variables of the family.
+        factor: factor on the family's period.
         merit: the weighted sum, or γ.
-        values: (k,) of the objectives or goals, not smoothed, at the problem's samples.
+        values: (k,) unsmoothed objectives or goals at the problem's samples.
         history: merits of the improving feasible iterates, falling.
-        evaluations: of everything, with gradients.
-        feasible: share of them that kept all constraints at the samples.
-        seconds: it took.
-        seed: of its start; `interrupted`: ended by Ctrl-C.
-        times: of the history, processor seconds since its start.
+        evaluations: number of evaluations of constraints and merit.
+        feasible: share of the evaluations that kept all constraints at the samples.
+        seconds: wall-clock time of the search [s].
+        seed: number of the random start; −1 for a given start.
+        interrupted: True after Ctrl-C.
+        times: processor time [s] since the search began, for each entry of `history`.
     """
 
     x: np.ndarray
@@ -90,9 +98,10 @@ class Stuck:
     """Result of a search that found no feasible motion.
 
     Attributes:
-        x, factor: of the motion that broke the constraints least.
-        excess: of its constraints over their scales, and of its hard goals over theirs.
-        evaluations: what the search cost; `reason`: why the optimiser ended, where it says so.
+        x, factor: variables and factor on the period of the motion that broke the constraints least.
+        excess: its largest excess over the constraints, and over the hard goals, each relative to their scale.
+        evaluations: number of evaluations of the search.
+        reason: why the optimiser ended, empty where it gives no reason.
     """
 
     x: np.ndarray
@@ -110,14 +119,23 @@ def one_start(
     start: int | np.ndarray,
     stages: tuple[Stage, ...] = STAGES,
 ) -> SearchResult | Stuck:
-    """Search from one random start (its number) or from given variables.
+    """Search from one random start (its number) or from given variables (p,).
 
-    Where the best motion of a stage breaks a limit between the samples by more than `max_break`, the stage goes on with
-    the instants where that was, from there or, where that cannot be repaired, from the last motion that did not.
+    Where the best motion of a stage breaks a limit between the samples by more than a share of its scale, the stage is
+    repeated with those instants as extra times, from that motion or, where it cannot be repaired, from the last motion
+    that
+    keeps the limits.
 
     Args:
-        evaluations: most, if all of `STAGES` are gone through.
-        stages: those to go through, a given start with the whole family in all of them.
+        problem: the problem.
+        evaluations: largest number of evaluations over all of `STAGES`.
+        method: see `calib.trajectories.design.optimise.design`.
+        seed: seed of the random start.
+        start: number of the random start, or variables to start from.
+        stages: the stages to run; given variables are never searched in the coarse family.
+
+    Returns:
+        The result, or a `Stuck` where no motion kept the constraints.
     """
     began = time.perf_counter()
     random = isinstance(start, int | np.integer)
@@ -170,7 +188,7 @@ def one_start(
 
 
 def _at_stage(problem: ExcitationProblem, stage: Stage, extra: np.ndarray) -> tuple[ExcitationProblem, Basis]:
-    """Return the problem of a stage, with extra times, and its basis."""
+    """Return the problem as a stage sees it (samples, family), with `extra` times [s], and its basis."""
     problem = replace(problem, extra=extra)
     if stage.rough:
         problem = replace(problem, samples=max(8, problem.samples // 2))
@@ -180,7 +198,7 @@ def _at_stage(problem: ExcitationProblem, stage: Stage, extra: np.ndarray) -> tu
 
 
 class StartSearch:
-    """One start's search in one problem: the state that the optimiser's callbacks share."""
+    """One start's search in one problem: the state shared by the optimiser's callbacks."""
 
     def __init__(self, problem: ExcitationProblem, basis: Basis):
         self.problem = problem
@@ -212,13 +230,16 @@ class StartSearch:
         return last
 
     def broken(self, y: np.ndarray) -> np.ndarray:
-        """Return the times of a motion that breaks limits between samples by more than `max_break`; empty if none."""
+        """Return the times [s] at which a motion breaks limits between samples by more than `max_break`; empty if none.
+        """
         # of a constraint's scale: a motion that breaks it by more between the samples leads nowhere (our choice)
         max_break = 0.02
         return critical_times(self.problem, y, max_break)
 
     def last_unbroken(self) -> np.ndarray:
-        """Return the last improving point within limits between samples, by bisection; the first one if none is."""
+        """Return the last improving point that keeps the limits between samples, by bisection; the first point if none
+        does.
+        """
         low, high = 0, len(self._trail) - 1
         while high - low > 1:
             middle = (low + high) // 2
