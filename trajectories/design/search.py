@@ -250,7 +250,7 @@ class StartSearch:
         return self._trail[low]
 
     def continued(self, y: np.ndarray, problem: ExcitationProblem, basis: Basis) -> tuple[StartSearch, np.ndarray]:
-        """Return the search of another problem continued from y, and its start point."""
+        """Return the search continued in another problem, and the point y expressed in that problem's variables."""
         if problem.family is not self.problem.family:
             p = self.basis.p
             path = self.problem.family.basis(basis.times).motion(y[:p])
@@ -266,7 +266,7 @@ class StartSearch:
         return new, y
 
     def result(self, y: np.ndarray, seconds: float, seed: int) -> SearchResult | Stuck:
-        """Return the result of the search; y: its last point."""
+        """Return the result of the search, which ended at the point y after `seconds` [s]."""
         p = self.basis.p
         stretch = self.problem.stretch
         best = self.reached(y)
@@ -297,7 +297,7 @@ class StartSearch:
         )
 
     def at(self, y: np.ndarray) -> Evaluation:
-        """Return the evaluation of a point, computed once; remember the best feasible one."""
+        """Return the evaluation of a point, computed once; the best feasible point is remembered."""
         key = (y.tobytes(), self.sharpness)
         if self._evaluation is None or key != self._at:
             self._evaluation = evaluate(self.problem, self.basis, y, self.sharpness)
@@ -307,7 +307,7 @@ class StartSearch:
         return self._evaluation
 
     def remember(self, y: np.ndarray, evaluation: Evaluation) -> None:
-        """Keep an evaluated motion if it is within the limits and the best so far, or the nearest to the limits."""
+        """Remember a point if it keeps the limits and is the best so far, or if it breaks them least so far."""
         missed = None
         if self.problem.goals:
             missed = unmet(self.problem, evaluation.values)
@@ -330,7 +330,7 @@ class StartSearch:
             self.times.append(time.process_time() - self.began)
 
     def inside(self, y: np.ndarray) -> np.ndarray:
-        """Return a point that keeps the constraints: repaired, or of a smaller motion if that fails."""
+        """Return a point that keeps the constraints: y repaired, or a smaller motion where that fails."""
         evaluation = self.repaired(y)
         max_halvings = 4  # times that a motion is halved which cannot be brought back inside
         for _ in range(max_halvings):
@@ -341,7 +341,8 @@ class StartSearch:
         return evaluation
 
     def repaired(self, y: np.ndarray, evaluations: int = 80) -> np.ndarray:
-        """Return a point that meets the constraints, or the nearest point found: min Σ max(0, c + 0.01)² by L-BFGS."""
+        """Return a point that keeps the constraints, or the last one of the repair: min Σ max(0, c + 0.01)² by L-BFGS.
+        """
         if not self.problem.constraints or self.at(y).constraints.max() <= 0:
             return y
 
@@ -360,7 +361,7 @@ class StartSearch:
         return self._optimised(solver, y)
 
     def solve(self, y: np.ndarray, evaluations: int, method: Method, tolerance: float = 1e-5) -> np.ndarray:
-        """Solve the smoothed problem from y (with goals followed by s, γ = e^s - 1)."""
+        """Return the optimiser's last point y for the smoothed problem; with goals it also varies s, γ = e^s - 1."""
         goals = self.problem.goals
         if goals:
             start = np.append(y, self._attainment(y))
@@ -395,7 +396,10 @@ class StartSearch:
         return len(self.at(np.ascontiguousarray(y)).constraints) + len(self.problem.goals)
 
     def _by_scipy(self, start: np.ndarray, last: int, tolerance: float) -> np.ndarray:
-        """Run SciPy's SLSQP (Kraft 1988) up to `last` evaluations; its subproblems are solved faster than in NLopt."""
+        """Return the last point of SciPy's SLSQP (Kraft 1988), run until the search has made `last` evaluations.
+
+        Its subproblems are solved faster than in NLopt.
+        """
         self._tried = start
         goal_variables = bool(self.problem.goals)
         rows = self._count(start[: len(start) - goal_variables])
@@ -454,7 +458,9 @@ class StartSearch:
         return run.x
 
     def _ends(self, size: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return bounds of the factor on the period and of s (γ from -0.98 to 10⁵); steps are not limited."""
+        """Return the bounds of all variables: of the factor on the period, and of s (γ from -0.98 to 10⁵); x is not
+        bounded.
+        """
         lower = np.full(size, -np.inf)
         upper = np.full(size, np.inf)
         p = self.basis.p
