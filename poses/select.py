@@ -487,8 +487,7 @@ def _selection(task: _Request, chosen: _Chosen, baseline: float, began: float) -
 
 
 def _ceiling(task: _Request, q: np.ndarray | None, climbs: int) -> Ceiling:
-    """Return the bound over the candidates and the chosen poses q, or over all feasible poses if `climbs` is above 0.
-    """
+    """Return bound over the candidates and the chosen poses q, or over all feasible poses if `climbs` is above 0."""
     space, joints = task.space, task.q
     if space is None or joints is None or q is None or (not climbs and np.isin(q, joints).all()):
         return Ceiling(task.bound.upper, task.bound.gap, 0, 0.0, np.zeros((0, 0)), 0)

@@ -88,8 +88,7 @@ def product(space: SearchSpace, q: np.ndarray, G: np.ndarray) -> np.ndarray:
 
 
 def constraint_values(space: SearchSpace, q: np.ndarray) -> np.ndarray:
-    """Return the values of all constraints (m, k) at poses q (m, n); a constraint is satisfied where its value is ≤ 0.
-    """
+    """Return values of all constraints (m, k) at poses q (m, n); a constraint is satisfied where its value is ≤ 0."""
     empty = np.zeros((len(q), 0))
     values = [np.asarray(constraint.function(q)) for constraint in space.constraints]
     return np.concatenate([empty, *values], axis=1)

@@ -126,8 +126,7 @@ class Family(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Freedom:
-    """All coefficients (C,) of one joint that satisfy its equations: particular (C,) + null (C, c) x, with free x (c,).
-    """
+    """All coefficients (C,) of one joint that satisfy its equations: particular (C,) + null (C, c) x, with free x (c,)."""
 
     particular: np.ndarray
     null: np.ndarray

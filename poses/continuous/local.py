@@ -167,8 +167,7 @@ def _search(
     sharpness: Sequence[float],
     deadline: float,
 ) -> Improved:
-    """Run the stages from one start and return the best set that keeps the constraints; the predicate is not checked.
-    """
+    """Run stages from one start and return the best set that keeps the constraints; the predicate is not checked."""
     feasible = bool(_keeps(space, start).all())
     best = start
     value = -np.inf

@@ -48,8 +48,7 @@ class AttainmentGoal:
         return self.weight
 
     def stated(self, value: float) -> float:
-        """Return a value F in the terms of `words`: mean torque over its limit, share of time covered, else F itself.
-        """
+        """Return a value F in terms of `words`: mean torque over its limit, share of time covered, else F itself."""
         if isinstance(self.objective, FrictionCoverage):
             return self.objective.wanted * (1.0 - float(np.sqrt(value)))  # of its rms shortfall
         if isinstance(self.objective, TorqueSlack):
@@ -360,8 +359,7 @@ def exact_values(problem: ExcitationProblem, motion: SampledMotion, regressor: n
 
 
 def merit(problem: ExcitationProblem, values: np.ndarray) -> float:
-    """Return the merit to minimise from objective values (k,): γ with goals, else the weighted sum with log conditions.
-    """
+    """Return merit to minimise from objective values (k,): γ with goals, else the weighted sum with log conditions."""
     if problem.goals:
         return max(goal.attainment(value) for goal, value in zip(problem.goals, values))
     total, _ = _summed(problem, list(values))

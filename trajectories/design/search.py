@@ -230,8 +230,7 @@ class StartSearch:
         return last
 
     def broken(self, y: np.ndarray) -> np.ndarray:
-        """Return the times [s] at which a motion breaks limits between samples by more than `max_break`; empty if none.
-        """
+        """Return times [s] at which a motion breaks limits between samples by more than `max_break`; empty if none."""
         # of a constraint's scale: a motion that breaks it by more between the samples leads nowhere (our choice)
         max_break = 0.02
         return critical_times(self.problem, y, max_break)
@@ -341,8 +340,7 @@ class StartSearch:
         return evaluation
 
     def repaired(self, y: np.ndarray, evaluations: int = 80) -> np.ndarray:
-        """Return a point that keeps the constraints, or the last one of the repair: min Σ max(0, c + 0.01)² by L-BFGS.
-        """
+        """Return a point that keeps constraints, or the last one of the repair: min Σ max(0, c + 0.01)² by L-BFGS."""
         if not self.problem.constraints or self.at(y).constraints.max() <= 0:
             return y
 

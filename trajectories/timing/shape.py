@@ -52,8 +52,7 @@ def count(waypoints: np.ndarray, stray: float) -> int:
 
 
 def build(waypoints: np.ndarray, phi: np.ndarray, stray: float = 0.0) -> Path:
-    """Return the path of parameters φ: log ratios of knot intervals, then the via points' offsets as shares of `stray`.
-    """
+    """Return path of parameters φ: log ratios of knot intervals, then the via points' offsets as shares of `stray`."""
     points = checked(waypoints)
     m, n = points.shape
     ratios = np.asarray(phi)[: m - 2]

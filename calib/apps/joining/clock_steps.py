@@ -54,8 +54,7 @@ class Equations:
 
 @dataclass(frozen=True)
 class Step:
-    """Change of the instrument's clock against the controller's by `size` ± `sigma` [s] at the instrument's `time` [s].
-    """
+    """Change of instrument's clock against the controller's by `size` ± `sigma` [s] at the instrument's `time` [s]."""
 
     time: float
     size: float

@@ -258,8 +258,7 @@ def residuals(cell: Installation, run: Run, rows: np.ndarray, clock: Clock) -> n
 
 
 def velocities(cell: Installation, run: Run, rows: np.ndarray, clock: Clock) -> np.ndarray:
-    """Return the velocities (3 or 6, m) [m/s, then rad/s] of the target at rows, by the installation's arm and the log.
-    """
+    """Return velocities (3 or 6, m) [m/s, then rad/s] of the target at rows, by the installation's arm and the log."""
     later = replace(clock, offset=clock.offset + TIME_STEP)
     sooner = replace(clock, offset=clock.offset - TIME_STEP)
     difference = residuals(cell, run, rows, later) - residuals(cell, run, rows, sooner)

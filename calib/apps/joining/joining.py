@@ -261,8 +261,7 @@ def merged(
 
 
 def _positions(sheet: Sheet) -> np.ndarray:
-    """Return the measured positions (m, 3) [m], of several targets those of the first; NaN where it was not measured.
-    """
+    """Return measured positions (m, 3) [m], of several targets those of the first; NaN where it was not measured."""
     columns = sheet.family(POSITION.names) or sheet.family(POSITION.names, "1")
     if not columns:
         refuse_data(sheet.table.file, f"has no x, y, z; found {', '.join(sheet.table.header)}")
@@ -344,8 +343,7 @@ def _number(text: str) -> str:
 def _at_times(
     joints: Table, points: Table, joint_column: str, point_column: str
 ) -> tuple[Table, np.ndarray, tuple[str, ...]]:
-    """Return the joints at the times of the points, the pose index (m,) of each point (-1 if the arm moved), and notes.
-    """
+    """Return joints at the times of the points, the pose index (m,) of each point (-1 if the arm moved), and notes."""
     t = _seconds(joints, joint_column)
     point_times = _seconds(points, point_column)
     not_after = np.flatnonzero(np.diff(t) <= 0.0)

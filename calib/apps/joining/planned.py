@@ -79,8 +79,7 @@ def read_planned(path: Path, chain: Chain, options: FileOptions) -> list[PoseMea
 
 
 def _stated_orders(points: Table, count: int) -> dict[str, np.ndarray]:
-    """Return the orders that the file may state, by names or by rows: description to index (m,) of each point's pose.
-    """
+    """Return orders that the file may state, by names or by rows: description to index (m,) of each point's pose."""
     orders = dict[str, np.ndarray]()
     name = column_of(points, NAMES)
     if name:

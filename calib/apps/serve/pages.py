@@ -47,8 +47,7 @@ SANDBOX = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox
 
 
 class Guard:
-    """Refuses requests without the token, with another host's name (DNS rebinding), and posts from other sites' pages.
-    """
+    """Refuses requests without token, with another host's name (DNS rebinding), and posts from other sites' pages."""
 
     def __init__(self, app: ASGIApp, token: str, host: str) -> None:
         self.app = app
@@ -242,8 +241,7 @@ def view(request: Request) -> Response:
 
 
 def go_on(request: Request) -> Response:
-    """Start a run of `calib next`, or of `calib redo` if the path names a step; no second one while a run is under way.
-    """
+    """Start a run of `calib next`, or of `calib redo` if path names a step; no second one while a run is under way."""
     work = request.app.state.work
     step = request.path_params.get("step", "")
     task = NEXT

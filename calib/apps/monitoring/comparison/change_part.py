@@ -1,5 +1,4 @@
-"""A part of a comparison, geometry or dynamics: verdict, findings, report section, numbers; subclasses add the figures.
-"""
+"""A part of a comparison, geometry or dynamics: verdict, findings, report section, numbers; subclasses add figures."""
 
 from __future__ import annotations
 

@@ -109,8 +109,7 @@ class ChangeTest:
         return tuple(parameter.name for parameter in self.parameters[1:] if parameter.explained > best - AS_WELL)
 
     def suffices(self, explained: float, count: int) -> bool:
-        """Return whether the χ² remaining after `count` parameters explained `explained` of it is no more than chance.
-        """
+        """Return whether χ² remaining after `count` parameters explained `explained` of it is no more than chance."""
         residual = max(self.chi2 - explained, 0.0)
         freedom = max(self.freedom - count, 1)
         return bool(chi2.sf(residual, freedom) > CHANCE)
@@ -143,8 +142,7 @@ class Tested:
         return along / size**2, 1.0 / size, (along / size) ** 2
 
     def together(self, chosen: np.ndarray) -> tuple[np.ndarray, float, int]:
-        """Return the changes (p,) of several parameters that explain most together, the χ² explained, and their rank.
-        """
+        """Return changes (p,) of several parameters that explain most together, the χ² explained, and their rank."""
         columns = self.columns[:, chosen]
         size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
         unit_columns = columns / size

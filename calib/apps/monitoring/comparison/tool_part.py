@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class ToolPart(ChangePart):
-    """Change of the geometry; ``today`` is the rms error [m] with the earlier parameters over the poses of both fits.
-    """
+    """Change of geometry; ``today`` is the rms error [m] with the earlier parameters over the poses of both fits."""
 
     kind: ClassVar = "geometry"
     table: ClassVar = "changes.csv"

@@ -123,8 +123,7 @@ def compare(before: Identified, after: Identified, motions: dict[str, MotionStat
 
 
 def _among(model: Identified, keys: list[Hashable]) -> tuple[np.ndarray, np.ndarray]:
-    """Return values (s,) and covariance (s, s) of a model's parameters in the order of `keys`, zero for those it lacks.
-    """
+    """Return values (s,) and covariance (s, s) of a model's parameters in order of `keys`, zero for those it lacks."""
     indices = [keys.index(key) for key in model.keys]
     values = np.zeros(len(keys))
     values[indices] = model.values
@@ -162,8 +161,7 @@ def _standard(before: Identified, after: Identified, keys: list[Hashable]) -> li
 
 
 def _distinct(columns: np.ndarray, first: int) -> list[int]:
-    """Return the indices of columns (s, p) that are not parallel to an earlier one; the `first` ones are always kept.
-    """
+    """Return indices of columns (s, p) that are not parallel to an earlier one; the `first` ones are always kept."""
     size = np.linalg.norm(columns, axis=0)
     unit = columns / np.where(size > 0.0, size, 1.0)
     chosen = list(range(first))

@@ -30,8 +30,7 @@ class _TorqueRow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TorquePart(ChangePart):
-    """Change of the dynamics; ``today`` is the worst share [%] of later measured torques that the earlier model leaves.
-    """
+    """Change of dynamics; ``today`` is the worst share [%] of later measured torques that the earlier model leaves."""
 
     kind: ClassVar = "dynamics"
     table: ClassVar = "torque_changes.csv"
