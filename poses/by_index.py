@@ -1,4 +1,4 @@
-"""Exchange of candidates for any observability index, by the singular values of each trial set."""
+"""Exchange of candidates for any observability index, judged by the singular values of every trial set."""
 
 from collections.abc import Callable
 
@@ -25,16 +25,16 @@ def exchanged_by_index(
     screening and its size are our choice; the result is a local optimum among screened exchanges only.
 
     Args:
-        jacobians: (N, rows, p) whitened Jacobians.
-        known_information: (p, p), already measured.
-        members: start.
+        jacobians: (N, rows, p) whitened Jacobians of the candidates.
+        known_information: (p, p) information of the poses already measured.
+        members: indices of the candidates to start from.
         index: "O1" ... "O5", "cond".
-        report: called with every improved set and its merit.
-        sweeps: most passes over all members.
-        screen: trials per member and rule.
+        report: called with every improved set and its merit; None for no report.
+        sweeps: largest number of passes over all members.
+        screen: number of trials per member and screening rule.
 
     Returns:
-        The members, and their merit log O (−log cond; O1 without 1/√m).
+        The indices of the members, and their merit log O (−log cond; O1 without 1/√m).
     """
     chosen = list(members)
     matrix = known_information + _gram(jacobians[chosen])
@@ -59,7 +59,7 @@ def exchanged_by_index(
 
 
 def merits(matrices: np.ndarray, index: Index) -> np.ndarray:
-    """Return log O (−log cond) of information matrices (K, p, p); −inf where singular.
+    """Return the merits log O (−log cond) (K,) of information matrices (K, p, p); −inf where a matrix is singular.
 
     Columns may have very different units, so accuracy ends where the ratio of singular values nears 1e-7.
     """

@@ -22,17 +22,18 @@ def draw_candidates(
 
     Args:
         lower, upper: (n,) joint limits [rad or m].
-        count: feasible poses wanted, N.
+        count: N, the number of feasible poses to return.
         feasible: predicate (m, n) -> (m,) bool; None accepts all.
         seed: integer or generator; the same seed gives the same poses.
-        max_draws: poses drawn at most; default 200 N, at least 100 000.
+        max_draws: largest number of poses drawn; None for 200 N, at least 100 000.
         block: poses per call of the predicate.
 
     Returns:
         (N, n) joint values, in the order of the sequence.
 
     Raises:
-        NothingFeasible: where `max_draws` draws hold fewer than N feasible poses; the message gives their share.
+        BadInput: limits that are not two (n,) arrays with lower < upper, or a count below 1.
+        NothingFeasible: fewer than N of `max_draws` poses are feasible; the message gives their share.
     """
     # slow to load
     from scipy.stats import qmc

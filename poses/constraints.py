@@ -1,9 +1,11 @@
 """Constraints on a measurement pose: tool height, distance from the axis, orientation to an instrument, line of sight.
 
-The quantities of the LWR4+ study's Table 1, and the line of sight. None knows a robot: they take the caller's forward
-kinematics as a callable, ``tool(q: (m, n)) -> (rotation (m, 3, 3), position (m, 3))`` in whatever frame the limits are
-written in, and, for exact gradients, ``tool_jacobian(q) -> (m, 6, n)``: velocity of that point, then angular velocity,
-both in that same frame. Every constraint is smooth where stated, and pickles if the callables do.
+These are the quantities of the LWR4+ study's Table 1, and the line of sight. No constraint knows a robot: each takes
+the caller's forward kinematics as a callable, ``tool(q: (m, n)) -> (rotation (m, 3, 3), position (m, 3))`` in the frame
+in which the limits are written, and, for exact gradients, ``tool_jacobian(q) -> (m, 6, n)``: velocity of the tool
+point,
+then angular velocity, both in that frame too. Every constraint is smooth unless its docstring says otherwise, and can
+be pickled if its callables can.
 """
 
 from collections.abc import Callable
@@ -19,7 +21,7 @@ ToolJacobian = Callable[[np.ndarray], np.ndarray]
 
 
 def height(tool: Tool, lowest: float, highest: float = np.inf, jacobian: ToolJacobian | None = None) -> PoseConstraint:
-    """Keep the tool point's height within lowest ≤ z ≤ highest [m]."""
+    """Return the constraint that the tool point's height is within lowest ≤ z ≤ highest [m]."""
     limits = _finite_limits(lowest, highest)
     slope = None
     if jacobian is not None:
@@ -29,7 +31,7 @@ def height(tool: Tool, lowest: float, highest: float = np.inf, jacobian: ToolJac
 
 
 def _finite_limits(lower: float, upper: float) -> tuple[tuple[float, float], ...]:
-    """Return sign and bound of each finite limit, so that sign · (value − bound) ≤ 0 keeps it."""
+    """Return (sign, bound) of each finite limit; a value keeps the limit where sign · (value − bound) ≤ 0."""
     limits = []
     if np.isfinite(lower):
         limits.append((-1.0, lower))
@@ -39,7 +41,7 @@ def _finite_limits(lower: float, upper: float) -> tuple[tuple[float, float], ...
 
 
 def axis_distance(tool: Tool, min_distance: float, jacobian: ToolJacobian | None = None) -> PoseConstraint:
-    """Keep d_xy = √(x² + y²) ≥ min_distance [m], in the smooth form min_distance² − x² − y² ≤ 0."""
+    """Return the constraint d_xy = √(x² + y²) ≥ min_distance [m], in the smooth form min_distance² − x² − y² ≤ 0."""
     slope = None
     if jacobian is not None:
         slope = partial(_axis_gradient, tool, jacobian)
@@ -50,7 +52,9 @@ def axis_distance(tool: Tool, min_distance: float, jacobian: ToolJacobian | None
 def reach(
     tool: Tool, max_distance: float, centre: ArrayLike = (0, 0, 0), jacobian: ToolJacobian | None = None
 ) -> PoseConstraint:
-    """Keep the tool's point within `max_distance` [m] of a centre (3,) [m]: ‖x − c‖² − max_distance² ≤ 0."""
+    """Return the constraint ‖x − c‖² − max_distance² ≤ 0: tool point x within `max_distance` [m] of `centre` c (3,)
+    [m].
+    """
     point = np.asarray(centre, dtype=float)
     slope = None
     if jacobian is not None:
@@ -62,9 +66,9 @@ def reach(
 def distance(
     tool: Tool, min_distance: float, max_distance: float, centre: ArrayLike, jacobian: ToolJacobian | None = None
 ) -> PoseConstraint:
-    """Keep the tool's point within an instrument's range, `min_distance` to `max_distance` [m] from a point (3,) [m].
+    """Return the constraint that the tool point is `min_distance` to `max_distance` [m] from an instrument at `centre`.
 
-    Not smooth at that point itself.
+    `centre` is a point (3,) [m]; the constraint is not smooth where the tool point coincides with it.
     """
     point = np.asarray(centre, dtype=float)
     limits = _finite_limits(min_distance, max_distance)
@@ -82,7 +86,7 @@ def orientation(
     pitch: tuple[float, float],
     jacobian: ToolJacobian | None = None,
 ) -> PoseConstraint:
-    """Keep the tool's roll and pitch in the camera frame within limits [rad].
+    """Return the constraint that the tool's roll and pitch in the camera frame are within limits [rad].
 
     R_camera^T R = Rot_z(yaw) Rot_y(pitch) Rot_x(roll). The convention is our reading of Table 1, which does not state
     it. Not smooth where roll jumps by 2π, nor at a pitch of ±π/2.
@@ -104,7 +108,8 @@ def orientation(
 def line_of_sight(
     tool: Tool, instrument: ArrayLike, axis: ArrayLike, half_angle: float, jacobian: ToolJacobian | None = None
 ) -> PoseConstraint:
-    """Keep the instrument inside the target's acceptance cone: cos(half_angle) − (R a)·u ≤ 0, u = (s − x)/‖s − x‖.
+    """Return the constraint that the instrument is in the target's acceptance cone: cos(half_angle) − (R a)·u ≤ 0,
+    u = (s − x)/‖s − x‖.
 
     Args:
         tool: forward kinematics of the target's centre x and orientation R.

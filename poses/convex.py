@@ -70,15 +70,18 @@ def bound(
     Args:
         jacobians: (N, rows, p) whitened Jacobians of the candidates.
         m: number of poses.
-        existing: (k, rows, p) Jacobians of poses already measured; they count in full.
-        capped: False where poses may be repeated (a looser bound otherwise).
-        tolerance: relative gap to stop at.
+        existing: (k, rows, p) Jacobians of poses already measured; they count in full. None without such poses.
+        capped: False allows a pose to be repeated, which makes the bound looser.
+        tolerance: relative gap at which the search for a tighter bound ends.
+
+    Raises:
+        BadInput, TooFewCandidates, NotIdentifiable: as `calib.poses.information.prepared`.
     """
     return relaxed(prepared(jacobians, m, existing), m, capped=capped, tolerance=tolerance)
 
 
 def relaxed(candidates: Candidates, m: int, *, capped: bool = True, tolerance: float = 1e-3, rounds: int = 12) -> Bound:
-    """Return the solved relaxation over prepared candidates; see `bound`."""
+    """Return the bound of the relaxation solved over prepared candidates; see `bound`."""
     z = candidates.z
     known_information = candidates.known
     count, _, p = z.shape
@@ -110,7 +113,7 @@ def relaxed(candidates: Candidates, m: int, *, capped: bool = True, tolerance: f
 
 
 def certificate(candidates: Candidates, x: np.ndarray, m: int, capped: bool = True) -> float:
-    """Return the upper bound on log det M that any weights x (N,) certify (+inf if M is singular)."""
+    """Return the upper bound on log det M that weights x (N,) certify, whichever they are (+inf if M is singular)."""
     certified = _certify(candidates.z, candidates.known, x, m, capped)
     return certified.log_upper + candidates.shift
 
@@ -149,7 +152,7 @@ def _certify(z: np.ndarray, known_information: np.ndarray, x: np.ndarray, m: int
 
 
 def _tighter(first: _Certified, second: _Certified) -> _Certified:
-    """Return the better weights of two, and the tighter bound of two."""
+    """Return the weights of larger log det of the two, with the tighter bound of the two."""
     upper = min(first.log_upper, second.log_upper)
     if second.logdet >= first.logdet:
         better = second
@@ -161,7 +164,7 @@ def _tighter(first: _Certified, second: _Certified) -> _Certified:
 def _warm(
     z: np.ndarray, known_information: np.ndarray, m: int, cap: float, steps: int = 6
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return initial weights by a few multiplicative steps, and their scores."""
+    """Return initial weights (N,) by a few multiplicative steps, and the candidates' scores (N,) at these weights."""
     x = np.full(len(z), m / len(z))
     matrix = information_of(z, known_information, x)
     scores = scores_of(z, matrix)
@@ -185,7 +188,7 @@ def _largest(values: np.ndarray, count: int) -> np.ndarray:
 
 
 def _priced(scores: np.ndarray, x: np.ndarray, active: np.ndarray, price: float, max_count: int) -> np.ndarray:
-    """Return the next active set: candidates with weight or near the price, and the worst violators."""
+    """Return the next active set: active candidates with weight or scores near the price, and the worst violators."""
     has_weight = x[active] > 1e-4
     near_price = scores[active] > 0.9 * price
     keep = active[has_weight | near_price]
@@ -210,7 +213,7 @@ def _interior(
     tolerance: float,
     max_steps: int = 30,
 ) -> tuple[np.ndarray, float, int]:
-    """Return optimal weights (K,) over few candidates, the price λ of the sum, and the steps taken.
+    """Return optimal weights (K,) over few candidates, the price λ of the constraint Σ x = m, and the steps taken.
 
     With duals u of x ≥ 0 and v of x ≤ cap, Newton's step of the perturbed optimality conditions is
 
@@ -274,7 +277,7 @@ def _newton_terms(z: np.ndarray, matrix: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _longest(value: np.ndarray, step: np.ndarray) -> float:
-    """Return the largest t with value + t step ≥ 0."""
+    """Return the largest t with value + t step ≥ 0; infinite where no step is negative."""
     falling = step < 0
     if not falling.any():
         return np.inf

@@ -1,4 +1,4 @@
-"""A set of chosen candidates, with its determinant updated per addition or removal.
+"""A set of chosen candidates, whose determinant is updated with each addition or removal.
 
 With C = M⁻¹ and one pose z (rows, p), the matrix determinant lemma and Woodbury's identity give
 
@@ -31,7 +31,7 @@ class Design:
     """Chosen candidates with their information and log det.
 
     Attributes:
-        members: their indices, in the order of choosing.
+        members: indices of the chosen candidates, in the order of choosing.
         inverse: (p, p) C = (known + ridge + Σ zᵀz)⁻¹.
         scores: (N,) tr(z_i C z_iᵀ) of all candidates.
         logdet: log det of C⁻¹.
@@ -46,7 +46,7 @@ class Design:
 
 
 def design_of(pool: Pool, members: tuple[int, ...]) -> Design:
-    """Return the design of given members, recomputed (this removes rounding errors of many updates)."""
+    """Return the design of given members, computed anew (this removes rounding errors of many updates)."""
     p = pool.z.shape[2]
     count = len(pool.z)
     rows = pool.z[list(members)].reshape(-1, p)
@@ -76,14 +76,16 @@ def best_addition(pool: Pool, design: Design, above: float = -np.inf, first: int
     """Return the candidate outside the design that raises log det most, and its gain.
 
     Exact, though few blocks are formed: by the arithmetic-geometric mean det(I + B) ≤ (1 + tr(B)/r)^r for r rows, so
-    candidates whose score alone cannot beat the best one found (or `above`) are skipped.
+    candidates whose score cannot beat the best gain so far (or `above`) are skipped.
 
     Args:
-        above: gains below this are of no interest.
-        first: candidates tried before the rule is applied.
+        pool: candidates.
+        design: the design to add to.
+        above: gains of log det up to this are not looked for.
+        first: number of candidates tried before any is skipped.
 
     Returns:
-        (index, gain); (−1, above) where none beats `above`.
+        (index, gain); (−1, above) where no candidate gains more than `above`.
     """
     rows = pool.z.shape[1]
     scores = np.where(design.taken, -np.inf, design.scores)
@@ -106,14 +108,14 @@ def best_addition(pool: Pool, design: Design, above: float = -np.inf, first: int
 
 
 def best_removal(pool: Pool, design: Design) -> tuple[int, float]:
-    """Return the member whose removal reduces log det least, and the (negative) gain."""
+    """Return the member whose removal reduces log det least, and the (negative) gain of log det."""
     members = np.array(design.members)
     gains = gains_of(pool, design, members, -1.0)
     return int(members[gains.argmax()]), float(gains.max())
 
 
 def gains_of(pool: Pool, design: Design, candidates: np.ndarray, sign: float) -> np.ndarray:
-    """Return log det(I ± z_i C z_iᵀ) of some candidates (K,)."""
+    """Return the gains log det(I ± z_i C z_iᵀ) (K,) of adding (sign 1) or removing (sign −1) each of K candidates."""
     z = pool.z[candidates]
     transposed = z.transpose(0, 2, 1)
     blocks = (z @ design.inverse) @ transposed

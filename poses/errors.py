@@ -14,10 +14,11 @@ def require(holds: object, message: str, kind: type[Exception] = BadInput) -> No
 
 
 class TooFewCandidates(ValueError):
-    """Fewer candidates than poses to choose.
+    """There are fewer candidates than poses to choose.
 
     Attributes:
-        found, wanted: the two counts.
+        found: number of candidates.
+        wanted: number of poses to choose.
     """
 
     def __init__(self, message: str, found: int, wanted: int):
@@ -26,10 +27,11 @@ class TooFewCandidates(ValueError):
 
 
 class NothingFeasible(ValueError):
-    """No pose, or fewer than asked for, within limits and predicate.
+    """No pose, or fewer poses than asked for, keep limits and predicate.
 
     Attributes:
-        found, draws: feasible poses found and poses drawn.
+        found: number of feasible poses.
+        draws: number of poses drawn.
     """
 
     def __init__(self, message: str, found: int, draws: int):
@@ -41,7 +43,7 @@ class NotIdentifiable(ValueError):
     """A set of poses that cannot determine all parameters.
 
     Attributes:
-        singular_values: of the column-scaled observation matrix, falling; None where it was not formed.
+        singular_values: singular values of the column-scaled observation matrix, falling; None where it was not formed.
     """
 
     def __init__(self, message: str, singular_values: np.ndarray | None = None):

@@ -15,7 +15,7 @@ TOLERANCE = 1e-9
 
 
 def greedy(pool: Pool, m: int) -> Design:
-    """Add the candidate that raises det M most, m times, starting from the known information."""
+    """Return the design of the m candidates added one after another, each the one that raises det M most."""
     design = design_of(pool, ())
     for _ in range(m):
         candidate, _ = best_addition(pool, design)
@@ -24,16 +24,16 @@ def greedy(pool: Pool, m: int) -> Design:
 
 
 def exchanged(pool: Pool, design: Design, report: Report | None = None, sweeps: int = 50) -> Design:
-    """Replace members one by one by the best candidate until no replacement raises det M.
+    """Return the design after replacing members one by one by the best candidate until no replacement raises det M.
 
     The modified Fedorov exchange (Fedorov 1972; one member after another: Cook & Nachtsheim 1980). The result is a
     local optimum: no single exchange improves it.
 
     Args:
         pool: candidates.
-        design: start.
-        report: called with every improved design.
-        sweeps: most passes over all members.
+        design: the design to start from.
+        report: called with every improved design; None for no report.
+        sweeps: largest number of passes over all members.
     """
     for _ in range(sweeps):
         before = design.logdet
@@ -98,20 +98,21 @@ def kicked(
     weights=None,
     seconds: float = np.inf,
 ) -> Design:
-    """Leave local optima: swap `size` random members for random candidates, exchange, keep the better set.
+    """Return the best design after random kicks: swap `size` members for random candidates, exchange, keep the better
+    set.
 
-    Iterated local search (Lourenço, Martin & Stützle 2003). Newcomers are drawn by their relaxed weights where known;
+    Iterated local search (Lourenço, Martin & Stützle 2003). New members are drawn by their relaxed weights where known;
     size and law are our choice.
 
     Args:
         pool: candidates.
-        design: start.
-        rounds: kicks.
-        seed: of the draws.
-        report: called with every improved design.
+        design: the design to start from.
+        rounds: number of kicks.
+        seed: seed of the draws.
+        report: called with every improved design; None for no report.
         size: members replaced by one kick.
         weights: (N,) relaxed weights, None for equal ones.
-        seconds: of processor time, after which no further kick begins.
+        seconds: processor time after which no further kick begins.
     """
     deadline = time.process_time() + seconds
     generator = np.random.default_rng(seed)
@@ -142,7 +143,7 @@ def kicked(
 def _excursion(
     pool: Pool, start: Design, upwards: bool, longest: int, failed: set[frozenset[int]]
 ) -> tuple[Design | None, set[frozenset[int]]]:
-    """Return the design at the end of one excursion (None if it went too far), and the designs passed."""
+    """Return the design at the end of one excursion (None if it exceeds m ± `longest`), and the designs passed."""
     m = len(start.members)
     passed = set[frozenset[int]]()
     design = start

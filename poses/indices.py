@@ -69,7 +69,7 @@ def gradient(W: ArrayLike, index: Index = "O1", m: int | None = None) -> tuple[f
 
 
 def merit(W: np.ndarray, index: Index, sharpness: float = np.inf) -> tuple[float, np.ndarray]:
-    """Return the merit that searches maximise, log O (−log cond; O1 with m = 1), and its gradient.
+    """Return the merit that searches maximise, log O (−log cond; O1 with m = 1), and its gradient by W.
 
     O2, O3, O4 and cond have kinks where singular values meet, which is where their optima lie. A finite sharpness a
     replaces log s1 by (1/a) log Σ s_i^a and log sp by −(1/a) log Σ s_i^−a: smooth, and at most log(p)/a too pessimistic
@@ -128,12 +128,14 @@ def index_of_singular_values(s: np.ndarray, index: Index, m: int) -> np.ndarray:
 
 
 def has_kinks(index: Index) -> bool:
-    """Return whether an index depends on single singular values, so that `merit` needs a smoothing sharpness."""
+    """Return whether an index depends on single singular values, so that `merit` is smooth with a finite sharpness
+    only.
+    """
     return index in _POWERS
 
 
 def log_slope(s: np.ndarray, index: Index) -> np.ndarray:
-    """Return ∂ log O / ∂s (p,)."""
+    """Return ∂ log O / ∂s (p,) at the singular values s (p,), largest first."""
     slope = np.zeros_like(s)
     if index == "O1":
         return 1.0 / (len(s) * s)
@@ -147,7 +149,9 @@ def log_slope(s: np.ndarray, index: Index) -> np.ndarray:
 
 
 def _soft_maximum(values: np.ndarray, sharpness: float) -> tuple[float, np.ndarray]:
-    """Return (1/a) log Σ exp(a x) and its derivatives, which sum to 1."""
+    """Return the smooth maximum (1/a) log Σ exp(a x) of values x, a = `sharpness`, and its derivatives by x; they sum
+    to 1.
+    """
     top = values.max()
     weights = np.exp(sharpness * (values - top))
     total = weights.sum()
@@ -155,7 +159,7 @@ def _soft_maximum(values: np.ndarray, sharpness: float) -> tuple[float, np.ndarr
 
 
 def _stacked(W: ArrayLike, index: Index, m: int | None) -> tuple[np.ndarray, int]:
-    """Return W as (all rows, p) and the number of poses."""
+    """Return W as (m rows, p), checked, and the number of poses m."""
     if index not in get_args(Index):
         names = ", ".join(get_args(Index))
         raise BadInput(f"index '{index}' is not known; take one of {names}")

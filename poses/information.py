@@ -16,13 +16,13 @@ RANK_TOLERANCE = 1e-7
 class Candidates:
     """Candidates in coordinates z = J T, in which their mean information is the unit matrix.
 
-    D-optimality does not see the change (log det shifts by a constant), numerics do.
+    D-optimality does not change with T (log det shifts by a constant); numerical accuracy improves.
 
     Attributes:
         z: (N, rows, p) transformed Jacobians.
         known: (p, p) transformed information of the poses already measured.
         transform: (p, p) T, upper triangular.
-        shift: log det(WᵀW) = log det(ZᵀZ) + shift.
+        shift: the constant in log det(WᵀW) = log det(ZᵀZ) + shift.
     """
 
     z: np.ndarray
@@ -34,8 +34,12 @@ class Candidates:
 def checked(jacobians: ArrayLike, name: str = "jacobians") -> np.ndarray:
     """Return Jacobians as a finite, C-contiguous (N, rows, p) array of floats.
 
+    Args:
+        jacobians: the array to check.
+        name: the argument's name for messages.
+
     Raises:
-        BadInput: with the shape found, or the first pose holding a value that is not finite.
+        BadInput: an array of another shape, or with values that are not finite; the message names the first such pose.
     """
     array = np.ascontiguousarray(jacobians, dtype=float)
     if array.ndim != 3 or 0 in array.shape[1:]:
@@ -52,17 +56,19 @@ def checked(jacobians: ArrayLike, name: str = "jacobians") -> np.ndarray:
 
 
 def prepared(jacobians: ArrayLike, m: int, existing: ArrayLike | None = None) -> Candidates:
-    """Return candidates in well-scaled coordinates; refuse them if m poses cannot determine all parameters.
+    """Return candidates in well-scaled coordinates, after checking that m poses can determine all parameters.
 
     T = D⁻¹ R⁻¹ with D the root mean square of the columns and RᵀR the mean information after that scaling.
 
     Args:
         jacobians: (N, rows, p) whitened Jacobians of the candidates.
         m: number of poses to choose.
-        existing: (k, rows, p) whitened Jacobians of poses already measured.
+        existing: (k, rows, p) whitened Jacobians of poses already measured; None without such poses.
 
     Raises:
-        BadInput, TooFewCandidates, NotIdentifiable
+        BadInput: wrong shapes, values that are not finite, m below 1.
+        TooFewCandidates: fewer candidates than m.
+        NotIdentifiable: too few equations, a zero column, or candidates without full rank.
     """
     array = checked(jacobians)
     count, rows, p = array.shape

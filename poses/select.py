@@ -111,7 +111,15 @@ class Selection:
 
 @dataclass(frozen=True)
 class _Chosen:
-    """Result of a method: members or joint values, history of merits, number of evaluations."""
+    """Result of a method.
+
+    Attributes:
+        members: indices into the candidates; None for methods that leave the candidates.
+        q: (m, n) joint values [rad or m]; None where `members` is given.
+        merits: history of the merit log O, rising.
+        evaluations: designs accepted, or evaluations of the index.
+        interrupted: True after Ctrl-C.
+    """
 
     members: tuple[int, ...] | None
     q: np.ndarray | None
@@ -122,7 +130,7 @@ class _Chosen:
 
 @dataclass(frozen=True)
 class _Request:
-    """Input of every method: the candidates, their relaxation, and the request."""
+    """What every method is called with: the candidates, their bound, and the arguments of `select_poses`."""
 
     jacobians: np.ndarray
     q: np.ndarray | None
@@ -210,11 +218,12 @@ def random_baseline(
     """Return the best index among random sets of m candidates: the baseline without optimisation.
 
     Args:
-        jacobians: (N, rows, p) candidates.
+        jacobians: (N, rows, p) whitened Jacobians of the candidates.
         m: poses per set.
         index: "O1" ... "O5", "cond".
-        existing: (k, rows, p) Jacobians that count in every set.
-        seed, sets: of the draw.
+        existing: (k, rows, p) Jacobians that count in every set; None without such.
+        seed: seed of the draw.
+        sets: number of sets drawn.
     """
     generator = np.random.default_rng(seed)
     count, _, p = jacobians.shape
@@ -259,7 +268,7 @@ def _candidates(
 
 
 def _exchange(task: _Request) -> _Chosen:
-    """Choose poses among the candidates; after Ctrl-C return the best so far."""
+    """Choose poses among the candidates by exchanges (detmax); after Ctrl-C return the best set until then."""
     candidates = task.candidates
     m = task.m
     p = task.jacobians.shape[2]
@@ -323,7 +332,7 @@ def _exchange(task: _Request) -> _Chosen:
 
 
 def _by_index(task: _Request, members: tuple[int, ...]) -> _Chosen:
-    """Improve the D-optimal set by exchanges for another index."""
+    """Improve the D-optimal set `members` by exchanges for the requested index, where that is not O1."""
     p = task.jacobians.shape[2]
     past = np.zeros((0, p))
     if task.before is not None:
@@ -347,7 +356,7 @@ def _by_index(task: _Request, members: tuple[int, ...]) -> _Chosen:
 
 
 def _polished(task: _Request) -> _Chosen:
-    """Choose among the candidates, then refine all joint values continuously."""
+    """Choose poses among the candidates, then improve all joint values continuously."""
     began = time.process_time()
     chosen = _exchange(task)
     if chosen.interrupted:
@@ -383,7 +392,7 @@ def _multistart(task: _Request, starts: int) -> _Chosen:
 
 
 def _mlsl(task: _Request) -> _Chosen:
-    """Look for a set everywhere within the limits, beginning at a random set of candidates."""
+    """Search for a set everywhere within the limits, beginning at a random set of candidates."""
     space, joints = _movable(task)
     task.progress(0, 1, "global search")
     [start] = random_starts(joints, task.m, 1, task.seed)
@@ -478,7 +487,7 @@ def _selection(task: _Request, chosen: _Chosen, baseline: float, began: float) -
 
 
 def _ceiling(task: _Request, q: np.ndarray | None, climbs: int) -> Ceiling:
-    """Return the bound over candidates and chosen poses, or over all feasible poses if `climbs` is set."""
+    """Return bound over the candidates and the chosen poses q, or over all feasible poses if `climbs` is above 0."""
     space, joints = task.space, task.q
     if space is None or joints is None or q is None or (not climbs and np.isin(q, joints).all()):
         return Ceiling(task.bound.upper, task.bound.gap, 0, 0.0, np.zeros((0, 0)), 0)
@@ -491,7 +500,7 @@ def _ceiling(task: _Request, q: np.ndarray | None, climbs: int) -> Ceiling:
 
 
 def _value(jacobians: np.ndarray, existing: np.ndarray | None, index: Index) -> float:
-    """Return an index of the chosen and the previously measured Jacobians together."""
+    """Return the index of the Jacobians of the chosen poses and of the poses measured before, together."""
     p = jacobians.shape[2]
     if existing is None:
         return observability(jacobians.reshape(-1, p), index, len(jacobians))

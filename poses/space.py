@@ -13,10 +13,10 @@ STEP = 1e-5
 
 @dataclass(frozen=True)
 class PoseConstraint:
-    """Inequality constraints of a pose.
+    """Inequality constraints on a pose.
 
     Attributes:
-        name: what a message calls it.
+        name: the constraint's name in messages.
         function: (m, n) -> (m, k), feasible where ≤ 0; a pose's values depend on that pose only.
         gradient: (m, n) -> (m, k, n); None takes central differences of `function` in one batch.
     """
@@ -35,8 +35,13 @@ class SearchSpace:
         lower, upper: (n,) joint limits [rad or m].
         jacobian_product: (q: (m, n), G: (m, rows, p)) -> (m, n), Σ_rp G[i,r,p] ∂J[i,r,p]/∂q[i,k]; None takes central
             differences of `jacobian` in one batch of 2 m n poses.
-        constraints: inequalities kept by the searches and by the candidates.
-        feasible: (m, n) -> (m,) bool, what has no gradient (collision, visibility by ray casting).
+        constraints: inequalities that candidates and results of searches satisfy.
+        feasible: (m, n) -> (m,) bool, a predicate for conditions without gradient (collision, visibility by ray
+            casting);
+            None accepts all.
+
+    Raises:
+        BadInput: limits that are not two finite (n,) arrays with lower < upper.
     """
 
     jacobian: Callable[[np.ndarray], np.ndarray]
@@ -59,7 +64,7 @@ class SearchSpace:
 
 
 def is_feasible(space: SearchSpace, q: np.ndarray, tolerance: float = 1e-8) -> np.ndarray:
-    """Return whether each pose (m, n) satisfies limits, constraints and predicate, (m,)."""
+    """Return whether each pose q (m, n) satisfies limits, constraints and predicate, (m,) bool."""
     above_lower = q >= space.lower - tolerance
     below_upper = q <= space.upper + tolerance
     good = np.all(above_lower & below_upper, axis=1)
@@ -83,7 +88,7 @@ def product(space: SearchSpace, q: np.ndarray, G: np.ndarray) -> np.ndarray:
 
 
 def constraint_values(space: SearchSpace, q: np.ndarray) -> np.ndarray:
-    """Return all constraints of poses q (m, n), (m, k): kept where ≤ 0."""
+    """Return values of all constraints (m, k) at poses q (m, n); a constraint is satisfied where its value is ≤ 0."""
     empty = np.zeros((len(q), 0))
     values = [np.asarray(constraint.function(q)) for constraint in space.constraints]
     return np.concatenate([empty, *values], axis=1)
@@ -97,7 +102,7 @@ def constraint_gradients(space: SearchSpace, q: np.ndarray) -> np.ndarray:
 
 
 def constraint_gradient(constraint: PoseConstraint, q: np.ndarray) -> np.ndarray:
-    """Return ∂c/∂q (m, k, n)."""
+    """Return the gradient ∂c/∂q (m, k, n) of a constraint's values c at poses q (m, n)."""
     if constraint.gradient is not None:
         return np.asarray(constraint.gradient(q), dtype=float)
     slopes = central_difference(constraint.function, q)

@@ -1,18 +1,18 @@
 """An upper bound over all poses within limits and constraints, not only over the candidates.
 
 The relaxation of `calib.poses.convex`, with poses allowed to repeat, over all feasible poses: a design is a measure ξ
-of mass
-m. By the general equivalence theorem (Kiefer & Wolfowitz 1960), for any M = M_known + ∫ JᵀJ dξ ≻ 0 and any m poses
+of mass m. By the general equivalence theorem (Kiefer & Wolfowitz 1960), for any M = M_known + ∫ JᵀJ dξ ≻ 0 and any m
+poses
 
     det M(q_1 ... q_m)^(1/p)  ≤  det M^(1/p) · (tr(M⁻¹ M_known) + m max_q d(q)) / p,    d(q) = tr(J(q) M⁻¹ J(q)ᵀ),
 
 the maximum over all feasible q. Candidates are the first support. Then, in rounds (Wynn 1970 added one pose, here all
-local maxima that are found), single poses climb d from the best poses known and from random ones under the constraints,
-with exact gradients, join the support, and the relaxation is solved again.
+local maxima that are reached), single poses climb d from the best poses known and from random ones under the
+constraints, with exact gradients; the ends of the climbs join the support, and the relaxation is solved again.
 
-**What is certain.** The formula holds for every pose that was looked at: the candidates, the chosen poses, all ends of
-climbs. That none outside lies higher rests on the climbs having found the global maximum of d, which starts at random
-make likely and do not prove; `climbs` says how many tried in vain.
+**What is certain.** The formula holds for every pose at which d was evaluated: the candidates, the chosen poses, all
+ends of climbs. That no other pose has a larger d rests on the climbs having reached the global maximum of d, which
+random starts make likely and do not prove; `Ceiling.climbs` is the number of climbs that found no larger d.
 """
 
 from collections.abc import Callable
@@ -34,16 +34,19 @@ MIN_DIFFERENCE = 0.1
 
 @dataclass(frozen=True)
 class Ceiling:
-    """Upper bound on det(WᵀW)^(1/p) of any m feasible poses together with those measured before.
+    """Upper bound on det(WᵀW)^(1/p) of any m feasible poses together with the poses measured before.
 
     Attributes:
         upper: the bound.
-        gap: what it may at most be loose against the relaxed optimum: upper / det M^(1/p) − 1.
-        climbs: local searches for a pose that breaks the bound in the last round, all in vain; 0: the bound covers the
-            candidates and the chosen poses only.
-        excess: by what the best pose they found exceeds the largest d of the support, relative; 0 where none does.
-        support: (K, n) poses that carry the relaxed design.
-        evaluations: of d in all climbs, poses one by one.
+        gap: upper / det M^(1/p) − 1, the most by which the bound may exceed the relaxed optimum, relative.
+        climbs: local searches of the last round for a pose that exceeds the bound, all without success; 0: the bound
+            covers
+            the candidates and the chosen poses only.
+        excess: by how much the best pose of these searches exceeds the largest d of the support, relative; 0 where it
+            does
+            not.
+        support: (K, n) poses that carry the relaxed design [rad or m].
+        evaluations: evaluations of d in all climbs, counted per pose.
     """
 
     upper: float
@@ -72,12 +75,12 @@ def bound_over_space(
         space: limits, constraints, Jacobian.
         q: (N, n) feasible poses to begin with: the candidates, and the chosen poses, which the bound then covers.
         m: number of poses.
-        existing: (k, rows, p) Jacobians of poses already measured.
+        existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
         climbs: local searches of the last round, half from the highest d, half from random poses; 0: none.
-        rounds: most rounds.
-        tolerance: excess of d to stop at, relative.
-        seed: of the random poses.
-        report: called with each round's number and the gap.
+        rounds: largest number of rounds.
+        tolerance: relative excess of d at which the rounds end.
+        seed: seed of the random poses.
+        report: called with each round's number and the gap; None for no report.
     """
     generator = np.random.default_rng([seed, 5])
     jacobians = np.asarray(space.jacobian(q), dtype=float)
@@ -163,7 +166,7 @@ def _climbed(space: SearchSpace, starts: np.ndarray, root: np.ndarray) -> tuple[
 def _starts(
     space: SearchSpace, q: np.ndarray, scores: np.ndarray, count: int, generator: np.random.Generator
 ) -> np.ndarray:
-    """Return start poses: half with the highest d, pairwise distinct, and half at random."""
+    """Return `count` start poses: half with the highest scores d, pairwise distinct, and half at random."""
     order = np.argsort(-scores, kind="stable")[: 20 * count]
     ranked_count = count - count // 2
     ranked = _apart(q[order])[:ranked_count]
@@ -175,7 +178,7 @@ def _starts(
 
 
 def _apart(q: np.ndarray) -> np.ndarray:
-    """Return the poses that differ pairwise by at least `MIN_DIFFERENCE` in some joint."""
+    """Return poses out of q (N, n), in order, that differ pairwise by more than `MIN_DIFFERENCE` in some joint."""
     distinct = np.zeros((0, q.shape[1]))
     for pose in q:
         if not len(distinct) or (np.abs(distinct - pose).max(1) > MIN_DIFFERENCE).all():

@@ -1,8 +1,9 @@
 """A smooth approach from any pose to the start of a motion, within velocity, acceleration and jerk limits.
 
-Ruckig (Berscheid & Kröger 2021, an open relative of the Reflexxes library that the 2019 study used) finds the fastest
+Ruckig (Berscheid & Kröger 2021, an open relative of the Reflexxes library that the 2019 study used) computes the
+fastest
 jerk-limited motion; all joints move in proportion, so the approach is a straight line in joint space and stays between
-its ends. Imported at the first call.
+its ends. Ruckig is imported at the first call.
 """
 
 import math
@@ -19,15 +20,15 @@ KINDS: tuple[str, ...] = ("velocity", "acceleration", "jerk")
 def straight_approach(
     start: np.ndarray, goal: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray, jerk: np.ndarray, rate: float
 ) -> Setpoints:
-    """Return the fastest approach from rest to rest, its duration rounded up to whole samples.
+    """Return the setpoints of the fastest approach from rest to rest, its duration rounded up to whole samples.
 
     Args:
-        start, goal: (n,) [rad or m].
-        velocity, acceleration, jerk: (n,) largest moduli [per s, s², s³], finite and above zero.
-        rate: of the controller [Hz].
+        start, goal: (n,) joint values [rad or m].
+        velocity, acceleration, jerk: (n,) largest moduli [rad or m, per s, s², s³], finite and above zero.
+        rate: sampling rate of the controller [Hz].
 
     Raises:
-        BadInput: naming the joint and what is wrong with it.
+        BadInput: poses, limits or a rate that are not valid, with the joint; or no approach was found.
     """
     start = np.asarray(start, dtype=float)
     goal = np.asarray(goal, dtype=float)

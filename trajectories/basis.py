@@ -50,7 +50,7 @@ class SampledMotion:
         return self.q, self.v, self.a, self.jerk
 
     def part(self, rows: np.ndarray) -> SampledMotion:
-        """Return the samples of the given indices."""
+        """Return the samples at the given row numbers."""
         return SampledMotion(self.times[rows], self.q[rows], self.v[rows], self.a[rows], self.jerk[rows])
 
 
@@ -60,9 +60,9 @@ class Basis:
 
     Attributes:
         times: (N,) [s].
-        offsets: (4, N, n) what no variable changes.
-        tables: (n, 4, N, c) slopes by the variables of each joint, zero where a joint has fewer than c.
-        used: (n, c) which of these variables exist; x holds them joint after joint.
+        offsets: (4, N, n) position, velocity, acceleration and jerk at zero variables.
+        tables: (n, 4, N, c) their derivatives by the variables of each joint, zero where a joint has fewer than c.
+        used: (n, c) True where a joint has that variable; x stacks the variables joint after joint.
     """
 
     times: np.ndarray
@@ -91,7 +91,7 @@ class Basis:
         return SampledMotion(self.times, *orders)
 
     def nearest(self, q: np.ndarray) -> np.ndarray:
-        """Return the variables (p,) whose positions come nearest to q (N, n): least squares over the times."""
+        """Return the variables (p,) whose motion comes nearest to positions q (N, n): least squares over the times."""
         variables = np.zeros(self.used.shape)
         for j, exists in enumerate(self.used):
             position_table = self.tables[j, 0][:, exists]
@@ -126,14 +126,18 @@ class Family(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Freedom:
-    """Coefficients (C,) of one joint that satisfy its equations: particular (C,) + null (C, c) x."""
+    """All coefficients (C,) of one joint that satisfy its equations: particular (C,) + null (C, c) x, with free x (c,)."""
 
     particular: np.ndarray
     null: np.ndarray
 
 
 def freedom(rows: np.ndarray, values: np.ndarray) -> Freedom:
-    """Return a solution of rows (e, C) · coefficients = values (e,), and an orthonormal basis of the null space."""
+    """Return the solutions of the equations rows (e, C) · coefficients = values (e,).
+
+    Raises:
+        BadInput: the equations have no solution.
+    """
     if not len(rows):
         parameters = rows.shape[1]
         return Freedom(np.zeros(parameters), np.eye(parameters))
@@ -149,10 +153,16 @@ def holding(
     """Return coefficient counts and start values of the joints, including joints held at a fixed value.
 
     Args:
+        counts: coefficient count of each joint.
         none: the count that locks a joint.
+        start: (n,) joint values at the start [rad or m]; None leaves them free.
+        held: joint index to the value [rad or m] at which it is held; None holds no joint.
+
+    Returns:
+        The counts, and the start value of each joint, None where it is free.
 
     Raises:
-        BadInput: for a joint that is not there, a value that is none, or one that the start contradicts.
+        BadInput: a joint that does not exist, a value that is not finite, or one that contradicts the start.
     """
     values = list(counts)
     first: list[float | None] = [None] * len(counts)
@@ -169,7 +179,9 @@ def holding(
 
 
 def assemble(times: np.ndarray, tables: Sequence[np.ndarray], freedoms: Sequence[Freedom]) -> Basis:
-    """Return the basis from the joints' coefficient tables (4, N, C_j) and equations."""
+    """Return the basis at times (N,) from the joints' coefficient tables (4, N, C_j) and the solutions of their
+    equations.
+    """
     n = len(tables)
     widths = [free.null.shape[1] for free in freedoms]
     widest = max(1, *widths)
@@ -185,14 +197,14 @@ def assemble(times: np.ndarray, tables: Sequence[np.ndarray], freedoms: Sequence
 
 
 def counts_of_joints(counts: int | Sequence[int], joints: int | None) -> tuple[int, ...]:
-    """Return the count of each joint, of one number for all of them or one for each."""
+    """Return the count of each joint, from one number for all joints or one number per joint."""
     if isinstance(counts, Sequence | np.ndarray):
         return tuple(int(count) for count in counts)
     return (int(counts),) * (joints or 0)
 
 
 def joined(freedoms: Sequence[Freedom], x: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the coefficients (C_j,) of every joint for variables x."""
+    """Return the coefficients (C_j,) of every joint for variables x (p,)."""
     widths = [free.null.shape[1] for free in freedoms]
     ends = np.cumsum(widths)[:-1]
     parts = np.split(x, ends)
@@ -200,7 +212,7 @@ def joined(freedoms: Sequence[Freedom], x: np.ndarray) -> tuple[np.ndarray, ...]
 
 
 def projected(freedoms: Sequence[Freedom], coefficients: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the variables whose coefficients are nearest to the given ones."""
+    """Return the variables (p,) whose coefficients are nearest to the given ones (C_j,) of every joint."""
     variables = []
     for free, values in zip(freedoms, coefficients):
         displacement = np.asarray(values) - free.particular
@@ -209,15 +221,15 @@ def projected(freedoms: Sequence[Freedom], coefficients: Sequence[np.ndarray]) -
 
 
 def sample_times(period: float, count: int, shift: float = 0.0) -> np.ndarray:
-    """Return `count` times [s] over one period without its end; `shift` in steps."""
+    """Return `count` equidistant times [s] over one period, the end excluded, moved by `shift` steps."""
     return (np.arange(count) + shift) * (period / count)
 
 
 def aligned_period(period: float, rate: float) -> int:
-    """Return the number of samples at a controller's rate [Hz] in one period [s]; refuse fractions.
+    """Return the number of samples at a controller's rate [Hz] in one period [s].
 
     Raises:
-        BadInput: where it holds no whole number, so that averaging over periods would mix instants.
+        BadInput: the number is not whole, so that averaging over periods would mix instants.
     """
     count = period * rate
     if not np.isfinite(count) or count < 1 or abs(count - round(count)) > 1e-6:

@@ -19,9 +19,9 @@ class BSpline:
 
     Attributes:
         period: T0 [s].
-        counts: (n,) control points C of each joint; 1 holds it at a constant.
-        degree: of the pieces.
-        freedoms: per joint.
+        counts: (n,) control points C of each joint; 1 holds the joint at a constant.
+        degree: degree of the polynomial pieces.
+        freedoms: for each joint, the control points that satisfy its equations.
     """
 
     period: float
@@ -34,7 +34,7 @@ class BSpline:
         return len(self.counts)
 
     def basis(self, times: np.ndarray) -> Basis:
-        """Return the family at times (N,) [s]."""
+        """Return the family's basis at times (N,) [s]."""
         tables = [_table(times, self.period, count, self.degree) for count in self.counts]
         return assemble(times, tables, self.freedoms)
 
@@ -43,7 +43,7 @@ class BSpline:
         return joined(self.freedoms, x)
 
     def variables(self, coefficients: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the variables nearest to given control points."""
+        """Return the variables (p,) whose control points are nearest to the given ones."""
         return projected(self.freedoms, coefficients)
 
     def evaluate(self, x: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
@@ -77,7 +77,7 @@ class BSpline:
         return np.array(bounds)
 
     def random(self, rng: np.random.Generator, centre: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
-        """Return variables of a random motion about a centre (n,) with control points spread by amplitude (n,)."""
+        """Return variables (p,) of a random motion about `centre` (n,), its control points spread by `amplitude` (n,)."""
         points = []
         for count, middle, size in zip(self.counts, centre, amplitude):
             points.append(middle + size * rng.normal(size=count))
@@ -98,8 +98,12 @@ def bspline_family(
     """Return the family of periodic splines with `points` control points (one number, or (n,); 1 locks a joint).
 
     Args:
+        points: control points of all joints, or of each joint; more than the degree, or 1.
+        period, joints, rest, start, held, rate: as for `calib.trajectories.fourier.fourier_family`.
         degree: 5 or more, so that the jerk has no kinks.
-        period, joints, rest, start, held, rate: as of `calib.trajectories.fourier.fourier_family`.
+
+    Raises:
+        BadInput: too few control points, a degree below 5, or a period that is not positive and finite.
     """
     counts = counts_of_joints(points, joints)
     if not counts or any(c != 1 and c <= degree for c in counts) or max(counts) == 1:

@@ -1,13 +1,13 @@
-"""Constraints of a motion: values that are at most zero at every sample, with exact gradients.
+"""Constraints on a motion: values that must be at most zero at every sample, with exact gradients.
 
 Joint, velocity, acceleration and jerk limits are linear in the variables; torques come from a regressor and parameters,
-with a margin for their uncertainty; places of the tool and of named points, and distances between bodies, come from
+with a margin for their uncertainty; positions of the tool and of named points, and distances between bodies, come from
 callables with derivative products. An optimiser sees each group of columns (a joint's limit, both signs) as one smooth
 function,
 
     c_r = (1/ρ) log Σ_{i, k in r} exp(ρ g_ik / scale_k)  ≥  max g / scale      (Kreisselmeier & Steinhauser 1979)
 
-so a feasible c means feasible samples; what happens between the samples is `calib.trajectories.design.verify`'s.
+so a feasible c means feasible samples; `calib.trajectories.design.verify` checks the motion between the samples.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,10 +31,11 @@ class MotionConstraint(Protocol):
     """Constraint with values (N, k), feasible if ≤ 0, each depending on one sample.
 
     Attributes:
-        name, unit: what messages call it, and what its values are in.
+        name: the constraint's name in messages.
+        unit: unit of its values.
         labels: (k,) names of the columns.
-        scale: (k,) [unit] what makes values of different constraints comparable.
-        groups: (k,) columns of one group are one function to the optimiser.
+        scale: (k,) [unit] by which values are divided to compare different constraints.
+        groups: (k,) group number of each column; the columns of a group are one function to the optimiser.
     """
 
     @property
@@ -54,11 +55,11 @@ class MotionConstraint(Protocol):
 
 
 class TwoSided:
-    """Columns of a limit from both sides: the upper sides of some rows, then their lower sides.
+    """Columns of a limit from both sides: the upper sides of the limited rows, then their lower sides.
 
     Attributes:
         joints: indices of the limited rows.
-        rows: names of all rows; default joint 1, 2 ...
+        rows: names of all rows; empty for joint 1, 2 ...
     """
 
     joints: np.ndarray
@@ -83,9 +84,12 @@ class BoxLimit(TwoSided):
 
     Attributes:
         order: r, 0 to 3.
-        lower, upper: (n,); infinite where there is no limit.
-        unit: of the values.
-        rows: names of the n rows; default joint 1, 2 ...
+        lower, upper: (n,) limits [rad or m, per s^r]; infinite where there is no limit.
+        unit: unit of the values in messages; empty for the unit of a rotary joint.
+        rows: names of the n rows; empty for joint 1, 2 ...
+
+    Raises:
+        BadInput: limits of the wrong shape or order, or limits of a derivative that exclude zero.
     """
 
     order: int
@@ -143,14 +147,18 @@ class TorqueLimit(TwoSided):
     """Torque limit |Y χ| + k √(y Σ yᵀ) ≤ (1 - margin) τ_max: the model's uncertainty is a margin.
 
     Attributes:
-        regressor, product: Y (N, n, b) of q, v, a, and its derivative product.
+        regressor: (q, v, a) -> Y (N, n, b).
+        product: derivative product of the regressor, (q, v, a, G (N, n, b)) -> slopes of Σ G · Y in q, v, a.
         parameters: (b,) χ.
         limits: (n,) τ_max [N m or N]; infinite where there is none.
-        covariance: (b, b) Σ of χ; None: exact.
-        deviations: k.
-        margin: a share of the limits besides.
+        covariance: (b, b) Σ of χ; None: χ is exact.
+        deviations: k, the number of standard deviations.
+        margin: further margin, as a share of the limits.
         torque_product: (q, v, a, χ, G (N, n)) -> slopes of Σ G · Y χ, where that is cheaper than `product`; or None.
-        rows: names of the n rows; default joint 1, 2 ...
+        rows: names of the n rows; empty for joint 1, 2 ...
+
+    Raises:
+        BadInput: parameters that are not finite, limits not above zero, or a margin outside 0 to below 1.
     """
 
     regressor: Regressor
@@ -217,7 +225,16 @@ def box_limits(
     jerk: np.ndarray | None = None,
     linear: Sequence[bool] | None = None,
 ) -> tuple[BoxLimit, ...]:
-    """Return the limits of position (lower, upper) and of the moduli of velocity, acceleration and jerk, each (n,)."""
+    """Return the limits of position (lower, upper) and of the moduli of velocity, acceleration and jerk, each (n,).
+
+    Args:
+        lower, upper: position limits [rad or m]; infinite where there is none.
+        velocity, acceleration, jerk: largest moduli [per s, s², s³]; None for no limit of that order.
+        linear: whether each joint is prismatic; None: all joints are rotary.
+
+    Raises:
+        BadInput: a limit that is not a number, not above zero, or a lower limit above the upper.
+    """
     units = UNITS
     if linear and all(linear):
         units = LINEAR_UNITS
@@ -241,11 +258,11 @@ class Smoothed(NamedTuple):
     """Smoothed values of a constraint along a motion.
 
     Attributes:
-        constraint: which.
+        constraint: the constraint.
         values: (r,) c of its groups.
         excess: max g / scale + tightening.
-        shares: (N, k) of each sample and column in its group's slope.
-        in_group: (r, k) which columns are a group's.
+        shares: (N, k) share of each sample and column in the slope of its group's value.
+        in_group: (r, k) True where a column belongs to a group.
     """
 
     constraint: MotionConstraint
@@ -270,9 +287,11 @@ class Smoothed(NamedTuple):
 def smoothed(
     constraint: MotionConstraint, motion: SampledMotion, sharpness: float, tightening: float = 0.0
 ) -> Smoothed:
-    """Return the smoothed constraints of a motion; gradients are computed on demand.
+    """Return the smoothed values of a constraint along a motion; gradients are computed on demand.
 
     Args:
+        constraint: the constraint.
+        motion: the motion at its samples.
         sharpness: ρ.
         tightening: added to every value, as a share of its scale.
     """

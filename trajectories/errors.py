@@ -19,8 +19,9 @@ class NothingFeasible(ValueError):
     """Raised where the search finds no motion within all constraints.
 
     Attributes:
-        constraint: the one that was broken most where the least was broken.
-        excess: by how much, in `unit`.
+        constraint: name of the constraint that the nearest motion breaks most.
+        excess: by how much it is broken, in `unit`.
+        unit: unit of `excess`.
     """
 
     def __init__(self, message: str, constraint: str, excess: float, unit: str):

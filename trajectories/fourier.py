@@ -20,8 +20,8 @@ class Fourier:
 
     Attributes:
         period: T0 [s].
-        harmonics: (n,) n_f of each joint; 0 holds it at a constant.
-        freedoms: per joint, coefficients ordered q0, a_1 … a_nf, b_1 … b_nf.
+        harmonics: (n,) n_f of each joint; 0 holds the joint at a constant.
+        freedoms: for each joint, the coefficients that satisfy its equations, ordered q0, a_1 … a_nf, b_1 … b_nf.
     """
 
     period: float
@@ -33,16 +33,16 @@ class Fourier:
         return len(self.harmonics)
 
     def basis(self, times: np.ndarray) -> Basis:
-        """Return the family at times (N,) [s]."""
+        """Return the family's basis at times (N,) [s]."""
         tables = [_table(times, self.period, count) for count in self.harmonics]
         return assemble(times, tables, self.freedoms)
 
     def coefficients(self, x: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Return q0, a, b (1 + 2 n_f,) of every joint."""
+        """Return the coefficients q0, a, b (1 + 2 n_f,) of every joint."""
         return joined(self.freedoms, x)
 
     def variables(self, coefficients: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the variables nearest to given coefficients."""
+        """Return the variables (p,) whose coefficients are nearest to the given ones."""
         return projected(self.freedoms, coefficients)
 
     def evaluate(self, x: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
@@ -82,20 +82,21 @@ def fourier_family(
     resonance: float | None = None,
     rate: float | None = None,
 ) -> Fourier:
-    """Return the family of Fourier series of a period.
+    """Return the family of Fourier series with a given period.
 
     Args:
-        harmonics: n_f, one for all joints or (n,); 0 locks a joint.
+        harmonics: n_f, one number for all joints or (n,); 0 locks a joint.
         period: T0 [s].
         joints: n, where `harmonics` is one number.
         rest: velocity and acceleration are zero at t = 0 and T0, whatever the variables.
         start: (n,) pose to start from [rad or m]; None: free.
-        held: joints (from 0) that stay, with their values [rad or m].
-        resonance: smallest resonance frequency ω_r [rad/s]; n_f ω0 has to stay below (the paper, section 4.3).
-        rate: the controller's [Hz]; a period has to hold a whole number of its samples.
+        held: indices (from 0) of joints that do not move, with their values [rad or m].
+        resonance: smallest resonance frequency ω_r [rad/s]; n_f ω0 has to be below it (the paper, section 4.3).
+        rate: sampling rate of the controller [Hz]; a period has to be a whole number of samples.
 
     Raises:
-        BadInput: for a period that is not positive, frequencies beyond the resonance, samples that do not fit.
+        BadInput: a period that is not positive, frequencies beyond the resonance, or a period of no whole number of
+            samples.
     """
     counts = counts_of_joints(harmonics, joints)
     if not counts or min(counts) < 0 or max(counts) < 1:

@@ -14,11 +14,16 @@ DIGITS = 9  # after the point: 1e-9 rad, and whole nanoseconds
 def joint_trajectory(
     track: Setpoints, joint_names: Sequence[str], every: int = 1, frame: str = ""
 ) -> dict[str, object]:
-    """Return the message as plain dictionaries; joints in rad or m, effort in N m or N if torques are known.
+    """Return a motion as the message's plain dictionaries; joints in rad or m, effort in N m or N if torques are known.
 
     Args:
-        every: take one sample out of so many (and the last), for controllers that interpolate.
+        track: the motion.
+        joint_names: (n,) names of the joints.
+        every: keep every so many samples (and the last one), for controllers that interpolate.
         frame: header.frame_id.
+
+    Raises:
+        BadInput: names that are not one per joint, or `every` below 1.
     """
     if len(joint_names) != track.n or len(set(joint_names)) != track.n:
         raise BadInput(f"the motion has {track.n} joints, the given names are {', '.join(joint_names) or 'none'}")

@@ -1,7 +1,7 @@
-"""Constraints on the arm's place: positions of the tool and of named points, and distances between bodies.
+"""Constraints on positions of the tool and of named points, and on distances between bodies.
 
-Places and distances come from callables with derivative products; see `calib.trajectories.constraints` for what a
-constraint has.
+Positions and distances come from callables with derivative products; see `calib.trajectories.constraints` for the
+interface of a constraint.
 """
 
 from collections.abc import Callable
@@ -17,15 +17,15 @@ MIN_RADIUS = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Workspace:
-    """Limits on points' distance from the base's z axis and height: d_xy ≥ least_radius, lowest ≤ z ≤ highest.
+    """Limits on points' distance from the base's z axis and on their height: d_xy ≥ radius, lowest ≤ z ≤ highest.
 
-    Written least² - x² - y² ≤ 0 over 2 · least, which is smooth on the axis too and a length near the limit.
+    The first is written (radius² - x² - y²) / (2 · radius) ≤ 0: smooth on the axis too, and a length near the limit.
 
     Attributes:
-        points: q (N, n) -> (N, k, 3) [m].
+        points: q (N, n) -> (N, k, 3) positions in the base frame [m].
         product: (q, G (N, k, 3)) -> (N, n), the slopes of Σ G · points.
-        names: (k,).
-        radius, lowest, highest: [m]; None: no such limit.
+        names: (k,) names of the points.
+        radius, lowest, highest: limits [m]; None: no such limit.
     """
 
     points: Callable[[np.ndarray], np.ndarray]
@@ -98,8 +98,8 @@ class Clearance:
     """Minimum distance `least` [m] between bodies.
 
     Attributes:
-        distances: q (N, n) -> (N, k) [m], negative inside.
-        gradients: q (N, n) -> (N, k, n), their derivatives.
+        distances: q (N, n) -> (N, k) distances of the pairs [m], negative where bodies overlap.
+        gradients: q (N, n) -> (N, k, n), the derivatives of the distances.
         labels: (k,) names of the pairs.
     """
 

@@ -1,10 +1,10 @@
 """Search for a motion in a recording, cut to whole periods, averaged with variance.
 
-The place is where the sum of squared differences between recording and reference is least,
+The motion is at the offset k where the sum of squared differences between recording q and reference r is least,
 
     D(k) = Σ_i |q(k + i) - r(i)|² = Σ |q|² + Σ |r|² - 2 (q ⋆ r)(k),
 
-one cross-correlation by FFT. Unlike the peak of q ⋆ r alone it is not drawn to where the recording is large.
+one cross-correlation by FFT. Unlike the peak of q ⋆ r alone, the minimum is not drawn to where the recording is large.
 """
 
 from dataclasses import dataclass
@@ -24,9 +24,9 @@ class Recalled:
     Attributes:
         start: first sample of the first period.
         period: samples per period.
-        periods: how many follow one another.
+        periods: number of successive periods.
         likeness: (periods,) 1 - D / Σ |r - mean|².
-        lag: of the best match behind whole samples, in samples, from -1/2 to 1/2.
+        lag: offset of the best match from a whole sample, in samples, from -1/2 to 1/2.
     """
 
     start: int
@@ -45,9 +45,9 @@ class Averaged:
     """Mean of signals over periods, with variance.
 
     Attributes:
-        mean: (period, k).
-        variance: (period, k) of a single sample, unbiased over the periods.
-        periods: that were averaged: the mean's variance is variance / periods.
+        mean: (period, k) mean of each sample over the periods.
+        variance: (period, k) variance of a single sample, unbiased over the periods.
+        periods: number of averaged periods: the mean's variance is variance / periods.
     """
 
     mean: np.ndarray
@@ -61,7 +61,7 @@ class Averaged:
 
 
 def find_periods(recorded: np.ndarray, reference: np.ndarray, skip: int = 0, likeness: float = LIKENESS) -> Recalled:
-    """Find a periodic motion in a recording.
+    """Return the whole periods of a motion in a recording.
 
     Args:
         recorded: (N, n) measured joint positions, at the reference's rate.
@@ -70,7 +70,7 @@ def find_periods(recorded: np.ndarray, reference: np.ndarray, skip: int = 0, lik
         likeness: share of the reference's variance that a period has to explain.
 
     Raises:
-        BadInput: where it is not there, with the nearest thing that is.
+        BadInput: arrays that do not match, or no period like the reference; the message names the nearest samples.
     """
     q = np.asarray(recorded, dtype=float)
     r = np.asarray(reference, dtype=float)
@@ -96,7 +96,7 @@ def find_periods(recorded: np.ndarray, reference: np.ndarray, skip: int = 0, lik
 
 
 def average(values: np.ndarray, mean: Recalled) -> Averaged:
-    """Return mean and variance of signals (N, k) over the complete periods of a recording (at least two)."""
+    """Return mean and variance of signals (N, k) over the whole periods `mean` of a recording (at least two)."""
     require(mean.periods >= 2, "one period has no variance: record two or more")
     signals = np.asarray(values, dtype=float)[mean.rows]
     parts = signals.reshape(mean.periods, mean.period, -1)
@@ -127,7 +127,7 @@ def sliding_products(x: np.ndarray, r: np.ndarray) -> np.ndarray:
 
 
 def _run_with(places: list[int], best: int, period: int) -> list[int]:
-    """Return the sequence of offsets, one period apart without a gap, that includes the best one."""
+    """Return the offsets that follow one another by exactly one period and include the best one."""
     k = places.index(best)
     first = last = k
     while first and places[first - 1] == places[first] - period:
@@ -138,7 +138,7 @@ def _run_with(places: list[int], best: int, period: int) -> list[int]:
 
 
 def _lag(similarity: np.ndarray, best: int) -> float:
-    """Return the peak of the parabola through the best match and its neighbours, relative to the match."""
+    """Return the peak of the parabola through the best match and its neighbours, in samples from the best match."""
     if not 0 < best < len(similarity) - 1:
         return 0.0
     before, lag_index, after = similarity[best - 1 : best + 2]

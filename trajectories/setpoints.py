@@ -19,9 +19,9 @@ class Setpoints:
     """Samples at a constant rate, both ends included.
 
     Attributes:
-        rate: [Hz].
+        rate: sampling rate [Hz].
         q, v, a: (N, n) [rad or m, and per s, per s²].
-        tau: (N, n) torques that go with it [N m or N]; None where no model was asked.
+        tau: (N, n) torques of the motion [N m or N]; None where they were not computed.
     """
 
     rate: float
@@ -46,7 +46,9 @@ class Setpoints:
         return (len(self) - 1) / self.rate
 
     def repeated(self, times: int) -> Setpoints:
-        """Return a closed motion repeated `times` times; both ends are included, so N - 1 samples a period."""
+        """Return a closed motion repeated `times` times; its first and last sample coincide, so a period is N - 1
+        samples.
+        """
         require(times >= 1, f"times = {times}: expected 1 or more")
         return joined([self] * times)
 
@@ -55,7 +57,7 @@ def joined(tracks: Sequence[Setpoints]) -> Setpoints:
     """Return tracks joined one after the other; each begins at the last sample of the previous one.
 
     Raises:
-        BadInput: for other rates, or a jump of position or speed at a seam, with its joint and size.
+        BadInput: tracks of different rates, or a jump of position or speed at a seam, with its joint and size.
     """
     rate = tracks[0].rate
     for k, (track, following) in enumerate(pairwise(tracks)):
@@ -92,12 +94,16 @@ def _check_seam(k: int, quantity: str, end: np.ndarray, start: np.ndarray, max_j
 
 
 def slowed(track: Setpoints, factor: float) -> Setpoints:
-    """Return the same path `factor` times slower, for a rehearsal: v / factor, a / factor²; torques unknown.
+    """Return the track `factor` times slower, for a rehearsal: v / factor, a / factor²; torques unknown.
 
     Positions between the samples come from cubic Hermite pieces, which meet q and v at every sample.
 
     Args:
+        track: the motion.
         factor: 1 or more; rounded to a whole number of samples at the end.
+
+    Raises:
+        BadInput: a factor below 1 or not finite.
     """
     require(np.isfinite(factor) and factor >= 1, f"rehearsal factor {factor:g}: expected 1 or more")
     if factor == 1:

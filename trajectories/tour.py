@@ -1,4 +1,4 @@
-"""Order of places for the shortest total time: an open tour, and durations of joint moves."""
+"""Order of stops for the shortest total time: an open tour, and durations of joint moves."""
 
 import numpy as np
 
@@ -11,11 +11,12 @@ STARTS = 12
 def move_times(start: np.ndarray, end: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
     """Return the durations (...) [s] of straight joint moves from rest to rest: trapezoids, all joints in proportion.
 
-    A joint that goes by d takes d/v + v/a where it reaches its speed (d ≥ v²/a), else 2 √(d/a); the slowest one rules.
+    A joint that moves by d takes d/v + v/a where it reaches its speed (d ≥ v²/a), else 2 √(d/a); the slowest joint
+    determines the duration.
 
     Args:
         start, end: (..., n) joint values [rad or m].
-        velocity, acceleration: (n,) largest moduli, above zero.
+        velocity, acceleration: (n,) largest moduli [per s, s²], above zero.
     """
     distance = np.abs(end - start)
     full = distance >= velocity**2 / acceleration
@@ -26,17 +27,17 @@ def move_times(start: np.ndarray, end: np.ndarray, velocity: np.ndarray, acceler
 
 
 def tour(times: np.ndarray, first: int | None = None) -> np.ndarray:
-    """Return an order (m,) of m places with nearly the shortest total time; the last place is free.
+    """Return an order (m,) of m stops with nearly the shortest total time; the last stop is free.
 
     Nearest neighbours from several starts, each improved by reversing parts (2-opt, Croes 1958) and by moving up to
-    three places elsewhere (Or 1976) until neither helps; the best is returned.
+    three stops elsewhere (Or 1976) until neither helps; the best order is returned.
 
     Args:
-        times: (m, m) symmetric, from each place to each other.
-        first: where it begins; None: anywhere.
+        times: (m, m) symmetric, durations from each stop to each other [s].
+        first: index of the stop to begin at; None: any.
 
     Raises:
-        BadInput: where `times` is no symmetric matrix of finite numbers.
+        BadInput: `times` is not a symmetric matrix of finite numbers.
     """
     cost = np.asarray(times, dtype=float)
     if cost.ndim != 2 or cost.shape[0] != cost.shape[1] or not np.isfinite(cost).all() or not np.allclose(cost, cost.T):
@@ -95,7 +96,7 @@ def _improved(order: np.ndarray, cost: np.ndarray) -> np.ndarray:
 
 
 def _reversed(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
-    """Return the tour after the reversal that saves most: edges a-b and c-d become a-c and b-d."""
+    """Return the tour after the reversal that saves most (edges a-b and c-d become a-c and b-d); None if none saves."""
     after = np.roll(order, -1)
     edge = cost[order, after]
     between_starts = cost[order[:, None], order]
@@ -108,7 +109,9 @@ def _reversed(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
 
 
 def _relocated(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
-    """Return the tour after moving up to three successive places, reversed or not, for the largest saving."""
+    """Return the tour after moving up to three successive stops, reversed or not, for the largest saving; None if none
+    saves.
+    """
     count = len(order)
     best = (1e-9, 0, 0, 0, False)
     after = np.roll(order, -1)

@@ -1,6 +1,8 @@
-"""Applications: what commands offer beside the procedure, each a package that can be deleted.
+"""Applications: commands beside the procedure, each a package that can be deleted.
 
-An application imports the toolkit by `PUBLIC` alone; other applications where `[tool.importlinter]` lets it.
+An application imports from the toolkit only what `PUBLIC` names, and other applications only where
+`[tool.importlinter]`
+allows it.
 """
 
 # what applications may import: the names of `import calib`, these modules, and what stands in these packages

@@ -1,9 +1,10 @@
 """Multi-level single linkage over all joint values (NLopt's MLSL), then the local search from the best set.
 
 MLSL (Rinnooy Kan & Timmer 1987; Sobol points as in Kucherenko & Sytsko 2005) starts a local search at a sampled point
-only if no better point lies near it, so that no optimum is searched twice. NLopt's knows bounds but no constraints:
-their violation is charged quadratically. The best set is brought back onto the constraints; poses that break them even
-so, or a predicate, are those of the start. Half of the effort is for MLSL, the rest for `calib.poses.continuous.local`.
+only if no better point lies near it, so that no optimum is searched twice. NLopt's MLSL handles bounds but no
+constraints: a violated constraint is charged quadratically. The best set is then corrected to satisfy the constraints;
+poses that still violate them, or the predicate, are replaced by those of the start. Half of the effort is for MLSL, the
+rest for `calib.poses.continuous.local`.
 """
 
 import time
@@ -31,15 +32,15 @@ def mlsl_search(
     evaluations: int = 5000,
     seconds: float = np.inf,
 ) -> Improved:
-    """Return a set of poses by MLSL and a local search from the best set that it found.
+    """Return a set of poses searched by MLSL, then by a local search from the best set of MLSL.
 
     Args:
         space: limits, constraints, predicate, Jacobian.
         start: (m, n) feasible poses, where MLSL begins [rad or m]; its other points are Sobol's.
-        index: what to improve.
-        existing: (k, rows, p) Jacobians of poses already measured.
-        evaluations: most of the index, of both parts together.
-        seconds: of processor time, of both parts together.
+        index: the observability index to improve.
+        existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
+        evaluations: largest number of evaluations of the index, in MLSL and local search together.
+        seconds: limit of processor time, for MLSL and local search together.
     """
     began = time.process_time()
     spent = 0
@@ -91,7 +92,9 @@ def mlsl_search(
 
 
 def _charged(space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarray | None) -> tuple[float, np.ndarray]:
-    """Return the smoothed merit of poses less the charge for violated constraints, and its gradient by q (m, n)."""
+    """Return the smoothed merit of poses q (m, n) minus the charge for violated constraints, and its gradient by q (m,
+    n).
+    """
     value, gradient = merit_of(space, q, index, existing, SHARPNESS[0])
     broken = np.maximum(constraint_values(space, q), 0.0)
     by_q = np.einsum("mk,mkn->mn", broken, constraint_gradients(space, q))

@@ -1,9 +1,9 @@
 """Deterministic local search over all m · n joint values at once, under constraints, with exact gradients.
 
 Sequential quadratic programming (SLSQP, Kraft 1988, in SciPy) on a smoothed index that is sharpened stage by stage (see
-`calib.poses.indices.merit`), each stage ended by stagnation. An iterate may leave the constraints a little, so that
-every stage ends with a restoration: Newton steps of least norm back onto what is violated, pose by pose. What is
-handed back is the best restored set by the index itself, unsmoothed.
+`calib.poses.indices.merit`); a stage ends when the merit stagnates. An iterate may violate the constraints a little, so
+every stage ends with a restoration: Newton steps of least norm until the constraints hold, pose by pose. The result is
+the best restored set by the index itself, unsmoothed.
 """
 
 import time
@@ -30,14 +30,14 @@ FEASIBLE = 1e-8
 
 @dataclass(frozen=True)
 class Improved:
-    """Result of a local search.
+    """Result of a search over joint values.
 
     Attributes:
         q: (m, n) poses [rad or m]; never worse than the start, feasible to `FEASIBLE` if the start was.
         merit: log O (−log cond; O1 without 1/√m).
         history: merits of the start and of every stage that improved on it, rising.
-        evaluations: of the index, with its gradient.
-        interrupted: True after Ctrl-C; q is then the best so far.
+        evaluations: number of evaluations of the index with its gradient.
+        interrupted: True after Ctrl-C; q is then the best set until then.
     """
 
     q: np.ndarray
@@ -50,7 +50,7 @@ class Improved:
 def merit_of(
     space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarray | None = None, sharpness: float = np.inf
 ) -> tuple[float, np.ndarray]:
-    """Return the merit log O of poses together with those measured before, and its gradient by q.
+    """Return the merit log O of poses together with the poses measured before, and its gradient by q.
 
     ∂ log O/∂q_ik = Σ_rp G[i,r,p] ∂J[i,r,p]/∂q_ik with G = ∂ log O/∂W (see `calib.poses.indices`).
 
@@ -58,11 +58,12 @@ def merit_of(
         space: gives the Jacobian and its derivative product.
         q: (m, n) poses [rad or m].
         index: "O1" ... "O5", "cond".
-        existing: (k, rows, p) Jacobians (or stacked, (k rows, p)) that count but do not move.
-        sharpness: of the smoothing, see `calib.poses.indices.merit`.
+        existing: Jacobians (k, rows, p), or stacked (k rows, p), of poses that count but do not move; None without
+            such.
+        sharpness: sharpness of the smoothing, see `calib.poses.indices.merit`; infinite for the index itself.
 
     Returns:
-        The merit and its gradient (m, n).
+        The merit and its gradient (m, n); −inf and zeros where W has not full column rank.
     """
     jacobians = np.asarray(space.jacobian(q), dtype=float)
     stacked = jacobians.reshape(-1, jacobians.shape[2])
@@ -89,21 +90,23 @@ def improved(
     sharpness: Sequence[float] = SHARPNESS,
     report: Callable[[float], None] | None = None,
 ) -> Improved:
-    """Improve a set of poses within limits and constraints, moving all joint values at once.
+    """Return a set of poses improved within limits and constraints, by moving all joint values at once.
 
-    A predicate without gradient cannot steer the search: poses that end where it says no go back to their start, and
-    the others are searched again around them (our choice).
+    A predicate without gradient cannot steer the search: poses at which it fails in the end go back to their start, and
+    the other poses are searched again around them (our choice).
 
     Args:
-        space: limits, constraints, Jacobian.
+        space: limits, constraints, predicate, Jacobian.
         q: (m, n) start [rad or m].
-        index: what to improve.
-        existing: (k, rows, p) Jacobians of poses already measured.
-        evaluations: most evaluations of index and gradient; a search stops by itself long before.
-        tolerance: gain of the merit over `PATIENCE` iterations to stop at; ten times that in all stages but the last.
-        seconds: of processor time to end after, whatever was reached by then.
-        sharpness: of the stages, for indices with kinks.
-        report: called with every improved merit.
+        index: the observability index to improve.
+        existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
+        evaluations: largest number of evaluations of index and gradient; a search ends by itself long before.
+        tolerance: gain of the merit over `PATIENCE` iterations below which the last stage ends; stages before end at
+            ten
+            times this.
+        seconds: processor time after which the search ends with the best set until then.
+        sharpness: sharpness of each stage, for indices with kinks.
+        report: called with every improved merit; None for no report.
     """
     deadline = time.process_time() + seconds
     start = np.asarray(q, dtype=float)
@@ -164,7 +167,7 @@ def _search(
     sharpness: Sequence[float],
     deadline: float,
 ) -> Improved:
-    """Run the stages from one start and return the best feasible set; the predicate is not checked."""
+    """Run stages from one start and return the best set that keeps the constraints; the predicate is not checked."""
     feasible = bool(_keeps(space, start).all())
     best = start
     value = -np.inf
@@ -224,16 +227,16 @@ def climb(
     """Maximise a smooth function of poses by SLSQP, until it gains less than `tolerance` over `PATIENCE` iterations.
 
     Args:
-        space: limits and constraints; its Jacobian and predicate are not looked at.
-        start: (m, n) [rad or m].
+        space: limits and constraints; its Jacobian and predicate are not used.
+        start: (m, n) poses [rad or m].
         objective: (m, n) -> value and gradient (m, n).
-        evaluations: most calls of the objective.
-        tolerance: see above.
+        evaluations: largest number of calls of the objective.
+        tolerance: gain over `PATIENCE` iterations below which the search ends.
         deadline: `time.process_time` at which to end.
 
     Returns:
-        The last iterate (m, n), which may break constraints a little (see `restored`), the calls, and whether Ctrl-C
-        ended the search.
+        The last iterate (m, n), which may break constraints a little (see `restored`), the number of calls of the
+        objective, and whether Ctrl-C ended the search.
     """
     m, n = start.shape
     count = 0
@@ -304,7 +307,7 @@ def climb(
 def restored(space: SearchSpace, q: np.ndarray, steps: int = 20) -> np.ndarray:
     """Return poses (m, n) corrected to satisfy the constraints, by Newton steps of least norm within the limits.
 
-    A pose that cannot be brought back in so many steps is returned where it got to.
+    A pose that still violates a constraint after `steps` steps is returned as it then is.
     """
     q = np.clip(q, space.lower, space.upper)
     for _ in range(steps if space.constraints else 0):
@@ -333,13 +336,13 @@ def restored(space: SearchSpace, q: np.ndarray, steps: int = 20) -> np.ndarray:
 
 
 def _keeps(space: SearchSpace, q: np.ndarray) -> np.ndarray:
-    """Return whether each pose satisfies the constraints that have gradients (m,)."""
+    """Return whether each pose satisfies the constraints, (m,) bool; the predicate is not checked."""
     satisfied = constraint_values(space, q) <= FEASIBLE
     return np.asarray(satisfied.all(axis=1))
 
 
 def _with_rows(space: SearchSpace, q: np.ndarray, existing: np.ndarray | None) -> np.ndarray | None:
-    """Return the rows of fixed poses appended to those measured before; `existing` itself if none are fixed."""
+    """Return the rows (R, p) of the poses q and of `existing` stacked; `existing` itself where q is empty."""
     if not len(q):
         return existing
     rows = np.asarray(space.jacobian(q), dtype=float)

@@ -1,4 +1,4 @@
-"""Multistart: the local search from several sets of feasible candidates, in parallel if `map` is."""
+"""Multistart: the local search from several sets of feasible candidates, in parallel if `map` runs in parallel."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -12,7 +12,7 @@ from ..space import SearchSpace
 
 
 def random_starts(q: np.ndarray, m: int, count: int, seed: int) -> list[np.ndarray]:
-    """Return `count` random sets of m poses out of candidates q (N, n); each set has a separate child of the seed."""
+    """Return `count` random sets (m, n) of the candidates q (N, n); each set has a separate child of the seed."""
     generators = np.random.default_rng(seed).spawn(count)
     return [q[generator.choice(len(q), m, replace=False)] for generator in generators]
 
@@ -32,13 +32,18 @@ def multistart_search(
 
     Args:
         space: limits, constraints, Jacobian; must pickle where `map` runs in other processes.
-        starts: sets (m, n) [rad or m].
-        index: what to improve.
-        existing: (k, rows, p) Jacobians of poses already measured.
-        evaluations: most evaluations per start.
-        seconds: of processor time; where it is finite the starts run here, one after another, until it is used up.
-        map: the builtin, or one that spreads the work; results in order.
-        report: called after each start with its number and result.
+        starts: sets (m, n) of poses [rad or m].
+        index: the observability index to improve.
+        existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
+        evaluations: largest number of evaluations per start.
+        seconds: limit of processor time; where it is finite the starts run in this process, one after another, until
+            the
+            time is used up.
+        map: the builtin, or a parallel map that returns results in order.
+        report: called after each start with its number and result; None for no report.
+
+    Raises:
+        ValueError: no starts.
     """
     best = None
     spent = 0
@@ -82,7 +87,7 @@ def _one(
 
 
 def _in_time(work: Callable[..., Improved], starts: Sequence[np.ndarray], deadline: float) -> Iterator[Improved]:
-    """Yield the searches that fit into the time limit, and always the first one."""
+    """Yield the results of the searches that begin before `deadline` [process time, s]; the first start always runs."""
     for number, start in enumerate(starts):
         if number and time.process_time() >= deadline:
             return

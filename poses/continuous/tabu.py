@@ -62,12 +62,12 @@ def tabu_search(
     Args:
         space: limits, constraints, predicate, Jacobian.
         m: number of poses.
-        index: what to improve.
-        existing: (k, rows, p) Jacobians of poses already measured.
-        seed: of all draws.
-        rule: its numbers.
-        seconds: of processor time, after which no pose is exchanged any more.
-        report: called after every step with the poses chosen so far and the merit.
+        index: the observability index to improve.
+        existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
+        seed: seed of all draws.
+        rule: settings of the tabu search.
+        seconds: processor time after which no further pose is exchanged.
+        report: called after every step with the number of poses chosen so far and the merit; None for no report.
     """
     generator = np.random.default_rng(seed)
     listed: deque[np.ndarray] = deque(maxlen=rule.length)
@@ -123,7 +123,9 @@ def _newcomer(
     listed: deque[np.ndarray],
     rule: TabuRule,
 ) -> tuple[np.ndarray, int]:
-    """Return an individually improved pose to add to `poses`, and the evaluations used; start and end become tabu."""
+    """Return an individually improved pose (n,) to add to `poses`, and the evaluations used; its start and end become
+    tabu.
+    """
 
     def allowed(q: np.ndarray) -> np.ndarray:
         good = is_feasible(space, q)
@@ -159,7 +161,7 @@ def _newcomer(
 
 
 def _spanning(rows: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
-    """Return log det(εI + information) (K,) of the rows after adding each Jacobian; columns are scaled by their rms."""
+    """Return log det(εI + information) (K,) of `rows` with each Jacobian added; columns are scaled by their rms."""
     mean_squares = (jacobians**2).mean((0, 1))
     scale = np.sqrt(mean_squares)
     scale = np.where(scale > 0, scale, 1.0)
@@ -174,7 +176,7 @@ def _spanning(rows: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
 def _least_useful(
     space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarray | None, spared: set[int]
 ) -> int:
-    """Return the removable pose whose removal leaves the largest merit."""
+    """Return the number of the pose, among those not spared, without which the merit is largest."""
     jacobians = np.asarray(space.jacobian(q), dtype=float)
     parameters = jacobians.shape[2]
     measured_rows = np.zeros((0, parameters))
@@ -190,7 +192,7 @@ def _least_useful(
 
 
 def _fixed(space: SearchSpace, poses: list[np.ndarray], existing: np.ndarray | None) -> np.ndarray | None:
-    """Return the rows (R, p) of the other poses and of those measured before."""
+    """Return the rows (R, p) of `poses` and of the poses measured before; `existing` itself where `poses` is empty."""
     if not poses:
         return existing
     q = np.array(poses)

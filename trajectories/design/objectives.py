@@ -1,5 +1,8 @@
 """Objectives of motion design, with exact gradients.
 
+Excitation indices are functions of the observation matrix W (all samples' regressors, rows of joint j divided by
+sigma_j) by the eigenvalues λ = s² of the information matrix M = Wᵀ W + M_existing, s the singular values of W:
+
 Of the observation matrix W (all samples' regressors, rows of joint j divided by sigma_j) with the information matrix
 M = Wᵀ W + M_existing, its eigenvalues λ = s², s the singular values of W:
 
@@ -32,9 +35,15 @@ Scaling = Literal["raw", "normalised"]
 
 
 class Value(NamedTuple):
-    """An objective's value and gradients: in torques (N, n), q, v, a, jerk (4, N, n), and duration [1/s].
+    """An objective's value and its gradients.
 
-    ``exact`` is the objective without smoothing, ``by_information`` ∂F/∂M (c, c) of the information's own.
+    Attributes:
+        value: the objective, smoothed.
+        by_torque: (N, n) gradient by the torques; None where the objective does not depend on them.
+        by_motion: (4, N, n) gradient by q, v, a, jerk; None where the objective does not depend on them.
+        by_duration: gradient by the duration [1/s].
+        exact: the objective without smoothing.
+        by_information: (c, c) gradient ∂F/∂M of an index of the information matrix; empty for other objectives.
     """
 
     value: float
@@ -46,9 +55,14 @@ class Value(NamedTuple):
 
 
 class Observed(NamedTuple):
-    """A weighted observation matrix W (n N, c), joint after joint, and M = Wᵀ W + M_existing (c, c).
+    """A weighted observation matrix and its information matrix, for the columns of a regressor that an objective uses.
 
-    Its columns are those of a regressor (N, n, b) that an objective is of.
+    Attributes:
+        W: (n N, c) weighted observation matrix, joint after joint.
+        M: (c, c) information Wᵀ W + M_existing.
+        shape: shape (N, n, b) of the regressor.
+        sigmas: (n,) standard deviations of the torques; None: 1.
+        columns: which of the regressor's b columns are in W.
     """
 
     W: np.ndarray
@@ -58,7 +72,7 @@ class Observed(NamedTuple):
     columns: np.ndarray | slice
 
     def by_regressor(self, by_information: np.ndarray) -> np.ndarray:
-        """Return ∂F/∂regressor (N, n, b) = 2 W S over the sigmas, with S = ∂F/∂M (c, c), symmetric."""
+        """Return ∂F/∂regressor (N, n, b) = 2 W S divided by the sigmas, with S = ∂F/∂M (c, c), symmetric."""
         count, n, b = self.shape
         slope = np.zeros((b, n, count))
         by_matrix = 2 * by_information @ self.W.T
@@ -74,13 +88,17 @@ class Excitation:
 
     Attributes:
         index: "cond", "logdet", "smallest" or "trace".
-        scaling: "raw", "normalised", or (b,) by which the columns are divided.
+        scaling: "raw", "normalised", or (b,) scales by which the columns are divided.
         sharpness: p of the smoothing; infinite for the index itself.
-        sigmas: (n,) standard deviations of the torques [N m or N]; None: 1. Infinite: that joint's rows tell nothing.
-        existing: (b, b) information of motions recorded before, in the same sigmas: the next motion complements them.
-            A triangle R of theirs gives it as Rᵀ R.
-        columns: (c,) which of the regressor's columns count; None: all.
-        task: (c, c) A of the index "trace", of these columns; None: the identity.
+        sigmas: (n,) standard deviations of the torques [N m or N]; None: 1. Infinite: that joint's rows do not count.
+        existing: (b, b) information of motions recorded before, with these sigmas, which the next motion complements;
+            None
+            without such motions. From a triangular factor R of their observation matrix it is Rᵀ R.
+        columns: (c,) indices of the regressor's columns that count; None: all.
+        task: (c, c) A of the index "trace", for these columns; None: the identity.
+
+    Raises:
+        BadInput: an unknown index or scaling.
     """
 
     index: Index = "cond"
@@ -104,11 +122,11 @@ class Excitation:
         return f"{self.index} scaled"
 
     def evaluate(self, motion: SampledMotion, regressor: np.ndarray) -> Value:
-        """Return the index and its gradient with respect to the information."""
+        """Return the index and its gradient with respect to the information, from a regressor (N, n, b)."""
         return self.seen(self.observed(regressor))
 
     def observed(self, regressor: np.ndarray) -> Observed:
-        """Return the observation matrix of a regressor (N, n, b), of the objective's columns, and its information."""
+        """Return the observation matrix of a regressor (N, n, b) in the objective's columns, with its information."""
         columns = slice(None)
         if self.columns is not None:
             columns = self.columns
@@ -123,12 +141,15 @@ class Excitation:
         return Observed(W, information(W, existing), regressor.shape, self.sigmas, columns)
 
     def seen(self, matrix: Observed) -> Value:
-        """Return the index of another observation matrix with the same columns, sigmas and existing information."""
+        """Return the index of an observation matrix formed with this objective's columns, sigmas and existing
+        information.
+        """
         value, by_m, exact = self.of_information(matrix.M)
         return Value(value, exact=exact, by_information=by_m)
 
     def of_information(self, M: np.ndarray) -> tuple[float, np.ndarray, float]:
-        """Return the index of an information matrix M (b, b), S = ∂F/∂M, symmetric, and the index without smoothing.
+        """Return the index of an information matrix M (c, c), its gradient S = ∂F/∂M, symmetric, and the unsmoothed
+        index.
 
         With C = D M D, D = diag(M)^-1/2 (normalised): ∂F/∂M = D S_C D - diag((C S_C)_kk / M_kk).
         """
@@ -162,7 +183,9 @@ class Excitation:
         return value, by_m, exact
 
     def _trace(self, M: np.ndarray) -> tuple[float, np.ndarray, float]:
-        """Return log tr(A M⁻¹) / 2, its derivative by M, -M⁻¹ A M⁻¹ / (2 tr), and the index again: it has no kinks."""
+        """Return log tr(A M⁻¹) / 2, its derivative -M⁻¹ A M⁻¹ / (2 tr) by M, and the index again (it needs no
+        smoothing).
+        """
         d = np.diag(M) ** -0.5
         scaled = M * d * d[:, None]
         eigenvalues, V = np.linalg.eigh(scaled)
@@ -176,7 +199,7 @@ class Excitation:
         return value, -0.5 * spread @ inverse / trace, value
 
     def _of_spectrum(self, eigenvalues: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return F and ∂F/∂λ; λ rising."""
+        """Return the index F and ∂F/∂λ from rising eigenvalues λ."""
         if self.index == "logdet":
             return -float(np.log(eigenvalues).mean()), -1.0 / eigenvalues / len(eigenvalues)
         low, by_low = _extreme(eigenvalues, -self.sharpness)
@@ -197,11 +220,12 @@ class TorqueSlack:
     never overstates the torque. τ = Y χ is the motor torque: link torques of a light wrist cannot reach such goals.
 
     Attributes:
-        joints: which.
+        joints: indices of the joints averaged over.
         parameters: (b,) χ, of the regressor's columns.
         limits: (n,) τ_max [N m or N].
         torque_product: (q, v, a, χ, G (N, n)) -> slopes of Σ G · Y χ.
-        label: name; default: by the joints.
+        smoothing: ε.
+        label: name in messages; empty for one made from the joints.
     """
 
     joints: tuple[int, ...]
@@ -233,12 +257,13 @@ class FrictionCoverage:
 
         F = mean over joints and the four ranges of  (max(0, 1 - share / wanted))²
 
-    Shares are means of logistic memberships of v: high: σ((±v - high) / (`width` high)), low: σ(±v / w) -
+    Shares are means of logistic memberships of v. High speed: σ((±v - high) / (`width` high)); low speed: σ(±v / w) -
     σ((±v - low) / w) with w = `width` low.
 
     Attributes:
         low, high: (n,) speeds [rad/s or m/s], 0 < low < high.
-        wanted: share of the time in each of the four ranges.
+        wanted: required share of the time in each of the four ranges.
+        width: width of the logistic transitions, relative to the speed.
     """
 
     low: np.ndarray
@@ -279,7 +304,7 @@ class FrictionCoverage:
 
 @dataclass(frozen=True)
 class Duration:
-    """The period [s], as an objective if it is a free variable."""
+    """The period [s] as an objective, where the period is a free variable."""
 
     name: str = "duration"
 
@@ -293,7 +318,7 @@ Objective = Excitation | TorqueSlack | FrictionCoverage | Duration
 
 
 def information(stacked: np.ndarray, existing: np.ndarray | None = None) -> np.ndarray:
-    """Return M = Wᵀ W + M_existing of a stacked W (rows, b)."""
+    """Return M = Wᵀ W + M_existing (b, b) of a stacked W (rows, b); without M_existing if `existing` is None."""
     M = stacked.T @ stacked
     if existing is None:
         return M
@@ -306,13 +331,16 @@ def condition_numbers(
     existing: np.ndarray | None = None,
     columns: np.ndarray | None = None,
 ) -> dict[str, float]:
-    """Return cond of the observation matrix, of raw and of normalised columns, by SVD (not via M).
+    """Return cond of the observation matrix with raw and with normalised columns, by SVD (not via M).
 
     Args:
         regressor: (N, n, b).
-        sigmas: (n,) row weights; None: 1.
-        existing: (b, b) information of motions recorded before.
-        columns: (c,) which columns count; None: all.
+        sigmas: (n,) standard deviations by which the rows are divided; None: 1.
+        existing: (b, b) information of motions recorded before; None without such motions.
+        columns: (c,) indices of the columns that count; None: all.
+
+    Returns:
+        The condition numbers by "raw" and "normalised"; infinite where a column is zero.
     """
     if sigmas is not None:
         regressor = regressor / sigmas[:, None]
@@ -346,7 +374,9 @@ def _stacked(regressor: np.ndarray) -> np.ndarray:
 
 
 def _extreme(eigenvalues: np.ndarray, p: float) -> tuple[float, np.ndarray]:
-    """Return log (Σ λ^p)^(1/p) and its gradient in λ; the log of the largest λ for p = ∞, of the smallest for -∞."""
+    """Return log (Σ λ^p)^(1/p) of eigenvalues λ and its gradient by λ; for p = ∞ log of the largest λ, for -∞ of the
+    smallest.
+    """
     logs = np.log(eigenvalues)
     if np.isinf(p):
         slope = np.zeros_like(logs)

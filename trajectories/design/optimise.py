@@ -1,8 +1,8 @@
 """Search for exciting motions: sequential quadratic programming from several feasible starts, gradients exact.
 
-A start is a random motion inside the joint limits (`calib.trajectories.design.starts`); if it breaks another
-constraint it is
-repaired (the squared excess is minimised), then searched from (`calib.trajectories.design.search`).
+A start is a random motion inside the joint limits (`calib.trajectories.design.starts`). If the start breaks another
+constraint it is repaired (the squared excess is minimised); then the search begins from it
+(`calib.trajectories.design.search`).
 """
 
 import time
@@ -37,17 +37,22 @@ def design(
     """Return the best motion over several starts.
 
     Args:
-        problem: must pickle where `map` runs in other processes.
-        starts: random ones, each from its own child of the seed, besides the guesses.
-        evaluations: most per start.
+        problem: the excitation problem; must pickle where `map` runs in other processes.
+        starts: number of random starts besides the guesses, each from its own child of the seed.
+        evaluations: largest number of evaluations per start.
         method: "slsqp" (Kraft 1988, of SciPy), or of NLopt "auglag" (augmented Lagrangian, Birgin & Martínez 2008,
             over L-BFGS), "mma" or "ccsaq" (sequential convex separable approximations, Svanberg 2002).
-        guesses: variables to start from, (p,) each.
-        map: the builtin, or one that spreads the work; results in order.
-        report: called with starts done, starts, and the best so far in words.
+        seed: seed of the random starts.
+        guesses: variables (p,) to start from besides; empty for none.
+        map: the builtin, or a parallel map that returns results in order.
+        report: called with the number of starts done, of all starts, and the best merit so far in words; None for no
+            report.
 
     Raises:
-        NothingFeasible: naming the constraint that stood in the way where the excess was least.
+        BadInput: an unknown method, or no starts.
+        NothingFeasible: no start reached a feasible motion; the message names the constraint that the nearest one
+            breaks.
+        NotExciting: no motion could be evaluated.
     """
     if method not in get_args(Method):
         raise BadInput(f"method '{method}' is not one of {', '.join(get_args(Method))}")
@@ -74,7 +79,7 @@ def design(
 
 
 class _Starts:
-    """Searches from several starts, in rounds."""
+    """Searches from several starts, run stage by stage."""
 
     def __init__(
         self,
@@ -98,7 +103,7 @@ class _Starts:
         self.interrupted = False
 
     def run(self, tasks: list[int | np.ndarray], stages: tuple[Stage, ...]) -> list[SearchResult]:
-        """Run the given stages of the search for each task; return the results."""
+        """Run the given stages of the search for each task and return the results that are feasible."""
         fresh = list[SearchResult]()
         search = partial(one_start, self.problem, *self.arguments, stages=stages)
         # a map in other processes may still hand back what it has
@@ -117,14 +122,16 @@ class _Starts:
         return fresh
 
     def _summary(self) -> str:
-        """Return the best merit so far in words."""
+        """Return a sentence on the best merit so far."""
         if not self.found:
             return "nothing feasible yet"
         best = min(result.merit for result in self.found)
         return f"best so far {best:.4g}"
 
     def promising(self) -> list[int | np.ndarray]:
-        """Return the variables of the best motions so far; infeasible ones last, by constraint violation."""
+        """Return the variables of the best third of the motions so far; infeasible ones rank last, by constraint
+        violation.
+        """
         feasible = sorted(self.found, key=lambda result: result.merit)
         infeasible = sorted(self.stuck, key=lambda stuck: stuck.excess)
         ranked = feasible + infeasible
@@ -138,12 +145,12 @@ class _Starts:
 
 
 def _kept(starts: int) -> int:
-    """Return the number of starts to search to the end."""
+    """Return how many of the starts the last stages are run for."""
     return max(1, round(KEPT * starts))
 
 
 def _nothing(problem: ExcitationProblem, stuck: list[Stuck], starts: int) -> NothingFeasible:
-    """Return an error that names the limiting constraint."""
+    """Return the error that names the constraint or hard goal which the nearest motion misses."""
     best = min(stuck, key=lambda start: start.excess)
     motion = stretched(problem.basis().motion(best.x), best.factor)
     if best.excess[0] <= 0.0 and problem.goals:

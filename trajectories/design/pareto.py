@@ -1,4 +1,4 @@
-"""Trade-offs between objectives: goals proposed from single-objective runs, and a front by sweeping one goal."""
+"""Trade-offs between objectives: goals proposed from single-objective runs, and a Pareto front by sweeping one goal."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -16,10 +16,11 @@ class Front:
     """Motions on a trade-off front between objectives.
 
     Attributes:
-        names: of the k objectives.
-        values: (m, k), not smoothed, of the motions found; `found` (m,) the motions.
-        best: (m,) whether no other one is as good in everything and better in something.
-        designed: which of them the front was to stand beside.
+        names: names of the k objectives.
+        values: (m, k) unsmoothed objectives of the motions.
+        found: (m,) search results of the motions.
+        best: (m,) True where no other motion is as small in every objective and smaller in one.
+        designed: number of the motion that the front is compared with.
     """
 
     names: tuple[str, ...]
@@ -59,7 +60,13 @@ def sweep(
     evaluations: int = 600,
     report: Callable[[int, int, str], None] | None = None,
 ) -> Front:
-    """Return a front by the ε-constraint (Haimes, Lasdon & Wismer 1971): the first objective's minima under bounds.
+    """Return a Pareto front by the ε-constraint (Haimes, Lasdon & Wismer 1971): minima of `first` under bounds on
+    `second`.
+
+    Bounds on the second objective, hard goals, are evenly spaced from its own optimum to its value at the optimum of
+    the
+    first. Each search starts from the best known motion within the bound, and from the motion nearest to the bound; the
+    better result counts.
 
     Levels of the second objective, a hard goal, go evenly from its own optimum to where the first one's lies. Each is
     searched from the best motion known that keeps the level, and from the motion nearest to it; the better one counts.
@@ -103,7 +110,7 @@ def sweep(
 
 
 def _of(problem: ExcitationProblem, objectives: Sequence[Objective], run: SearchResult) -> np.ndarray:
-    """Return the objectives of a motion, not smoothed."""
+    """Return the unsmoothed values (k,) of the objectives for a search result."""
     weighted = tuple((objective, 1.0) for objective in objectives)
     spot = replace(problem, objectives=weighted, goals=())
     motion = stretched(spot.basis().motion(run.x), run.factor)
@@ -112,7 +119,7 @@ def _of(problem: ExcitationProblem, objectives: Sequence[Objective], run: Search
 
 
 def non_dominated(values: np.ndarray) -> np.ndarray:
-    """Return which rows (m, k) are not dominated (no other row is as small everywhere and smaller somewhere)."""
+    """Return which rows (m, k) are not dominated, (m,) bool: no other row is as small everywhere & smaller somewhere."""
     nowhere_larger = (values[:, None] <= values[None]).all(-1)
     somewhere_smaller = (values[:, None] < values[None]).any(-1)
     better = nowhere_larger & somewhere_smaller

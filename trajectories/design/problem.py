@@ -1,8 +1,9 @@
 """An excitation problem: a family sampled over its period, objectives or goals, and constraints, with all gradients.
 
 Goal attainment (Gembicki 1974; the paper's eq. 24): min γ subject to F_i - w_i γ ≤ g_i, w_i = |g_i| by default, so that
-γ is the relative under- or overattainment; w_i = 0 makes a goal hard. Inside, γ = e^s - 1 with s free, and goals on a
-condition number are compared by logarithm: the same optimum, well scaled from 10⁶ down (our choice).
+γ is the relative under- or overattainment; w_i = 0 makes a goal hard. The optimiser's variable is s with γ = e^s - 1,
+and goals on a condition number are compared by logarithm: the optimum does not change, and the problem is well scaled
+from condition numbers of 10⁶ down (our choice).
 """
 
 from collections.abc import Sequence
@@ -22,7 +23,14 @@ INSTANTS = 2000  # over a period at which a motion is looked at between its samp
 
 @dataclass(frozen=True, eq=False)
 class AttainmentGoal:
-    """Goal F ≤ goal + weight · γ. If weight is None, |goal| is used; weight 0 makes the goal hard. `words` state it."""
+    """Goal F ≤ goal + weight · γ on an objective F.
+
+    Attributes:
+        objective: F.
+        goal: the value to attain.
+        weight: None takes |goal|; 0 makes the goal hard.
+        words: the goal in messages; empty for one made from name and value.
+    """
 
     objective: Objective
     goal: float
@@ -40,7 +48,7 @@ class AttainmentGoal:
         return self.weight
 
     def stated(self, value: float) -> float:
-        """Return a value F as `words` state it: mean torque over its limit, share of time covered, else F itself."""
+        """Return a value F in terms of `words`: mean torque over its limit, share of time covered, else F itself."""
         if isinstance(self.objective, FrictionCoverage):
             return self.objective.wanted * (1.0 - float(np.sqrt(value)))  # of its rms shortfall
         if isinstance(self.objective, TorqueSlack):
@@ -48,7 +56,7 @@ class AttainmentGoal:
         return value
 
     def attainment(self, value: float) -> float:
-        """Return the γ at which F = value just meets the goal; 0 or infinite for a hard goal."""
+        """Return the γ at which F = value just meets the goal; for a hard goal −∞ if it is met, else ∞."""
         if self.share == 0:
             rounding = 1e-6 * max(abs(self.goal), 1e-3)
             if value <= self.goal + rounding:
@@ -62,18 +70,22 @@ class ExcitationProblem:
     """Definition of an excitation design problem.
 
     Attributes:
-        family: of motions over one period.
-        regressor, product: (N, n, b) of q, v, a, and its derivative product: (q, v, a, G) -> slopes of Σ G · Y.
+        family: the family of motions over one period.
+        regressor: (q, v, a) -> Y (N, n, b).
+        product: its derivative product, (q, v, a, G (N, n, b)) -> slopes of Σ G · Y in q, v, a.
         objectives: pairs (objective, weight) of the sum to minimise (a condition number enters by its logarithm);
             ignored where there are goals.
-        constraints: of `calib.trajectories.constraints`.
-        goals: of goal attainment.
-        samples: instants over the period at which all is evaluated.
+        constraints: constraints on the motion, from `calib.trajectories.constraints`.
+        goals: goals of goal attainment; empty for the weighted sum of the objectives.
+        samples: number of instants over the period at which objectives and constraints are evaluated.
         stretch: (least, most) factor on the period; equal ends fix it.
-        extra: times [s] over the period at which the constraints are looked at besides.
-        tightening: how far inside the constraints to stay, as a share of each one's scale, one number or one for each:
-            room for what happens between the samples.
+        extra: further times [s] within the period at which the constraints are evaluated.
+        tightening: how far inside the constraints to stay, as a share of each constraint's scale, one number or one per
+            constraint: a margin for the motion between the samples.
         coarse: a family of fewer variables and the same period, in which random starts begin; None: the family itself.
+
+    Raises:
+        BadInput: invalid stretch, fewer than 8 samples, a coarse family that does not match, or nothing to minimise.
     """
 
     family: Family
@@ -101,25 +113,27 @@ class ExcitationProblem:
         return self.stretch[0] < self.stretch[1]
 
     def basis(self) -> Basis:
-        """Return the family at the samples, then at the extra times."""
+        """Return the family's basis at the sample times, then at the extra times."""
         times = np.append(sample_times(self.family.period, self.samples), self.extra)
         return self.family.basis(times)
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """Evaluation at a point: constraints, and on demand merit and gradients by (x, factor on the period).
+    """Evaluation of a problem at a point: constraints, and on demand merit and gradients by (x, factor on the period).
 
-    A step that is not taken needs no gradients, and a motion that is brought back inside its limits no merit: together
-    a third of what a search computes.
+    A step that is not taken needs no gradients, and a motion that is being corrected to keep its limits needs no merit:
+    skipping both saves a third of a search's computation.
 
     Attributes:
-        problem, basis: of the point.
-        motion: at the samples, then at the extra times; `factor` on its period.
+        problem: the problem.
+        basis: the family's basis at the problem's times.
+        motion: the motion at the samples, then at the extra times.
+        factor: factor on the period.
         sharpness: p of the spectra.
-        smoothed: of each constraint.
-        constraints: (r,) smoothed, feasible where ≤ 0.
-        excess: largest constraint value at the samples, over its scale.
+        smoothed: smoothed values of each constraint.
+        constraints: (r,) smoothed values of all constraints, feasible where ≤ 0.
+        excess: largest unsmoothed constraint value over its scale.
     """
 
     problem: ExcitationProblem
@@ -203,10 +217,12 @@ class Evaluation:
 
 
 def evaluate(problem: ExcitationProblem, basis: Basis, y: np.ndarray, sharpness: tuple[float, float]) -> Evaluation:
-    """Evaluate the constraints at y = (x, factor on the period if that is free), the rest on demand.
+    """Return the evaluation at y = (x, factor on the period where that is free).
 
     Args:
-        basis: `ExcitationProblem.basis`.
+        problem: the problem.
+        basis: result of `ExcitationProblem.basis`.
+        y: the point.
         sharpness: p of the spectra and ρ of the constraints.
     """
     x, factor = _variables(problem, y)
@@ -238,10 +254,11 @@ def critical_times(
     """Return the times over the family's period [s] at which a motion is near or beyond violated constraints.
 
     Args:
-        y: (x, factor on the period if that is free).
+        problem: the problem.
+        y: (x, factor on the period where that is free).
         min_excess: share of its scale by which a constraint has to be broken to count.
-        constraints: default the problem's.
-        count: instants to look at.
+        constraints: constraints to check; empty for the problem's.
+        count: number of instants to check.
     """
     times = sample_times(problem.family.period, count)
     x, factor = _variables(problem, y)
@@ -258,7 +275,7 @@ def critical_times(
 
 
 def _value(objective: Objective, motion: SampledMotion, Y: np.ndarray, observed: dict[_Matrix, Observed]) -> Value:
-    """Evaluate an objective; indices of one observation matrix share it."""
+    """Return an objective's value; excitation indices with equal columns, sigmas and information share one matrix."""
     if not isinstance(objective, Excitation):
         return objective.evaluate(motion, Y)
     key = _matrix(objective)
@@ -272,7 +289,9 @@ def _matrix(objective: Excitation) -> _Matrix:
 
 
 def _summed(problem: ExcitationProblem, values: list[float]) -> tuple[float, np.ndarray]:
-    """Return the weighted sum with log condition numbers, and its gradient (1, k) in the values."""
+    """Return the weighted sum of the objectives, condition numbers by logarithm, and its gradient (1, k) by their
+    values.
+    """
     is_log = [is_condition(objective) for objective, _ in problem.objectives]
     logs = np.array(is_log)
     weights = np.array([weight for _, weight in problem.objectives])
@@ -331,7 +350,7 @@ def is_condition(objective: Objective) -> bool:
 
 
 def exact_values(problem: ExcitationProblem, motion: SampledMotion, regressor: np.ndarray) -> np.ndarray:
-    """Return the unsmoothed objectives of a motion (k,)."""
+    """Return the unsmoothed values (k,) of the objectives, or of the goals' objectives, for a motion."""
     values = []
     for objective in _terms(problem):
         unsmoothed = _sharpened(objective, np.inf)
@@ -340,7 +359,7 @@ def exact_values(problem: ExcitationProblem, motion: SampledMotion, regressor: n
 
 
 def merit(problem: ExcitationProblem, values: np.ndarray) -> float:
-    """Return the merit to minimise: γ, or the weighted sum with log condition numbers."""
+    """Return merit to minimise from objective values (k,): γ with goals, else the weighted sum with log conditions."""
     if problem.goals:
         return max(goal.attainment(value) for goal, value in zip(problem.goals, values))
     total, _ = _summed(problem, list(values))
@@ -348,7 +367,7 @@ def merit(problem: ExcitationProblem, values: np.ndarray) -> float:
 
 
 def unmet(problem: ExcitationProblem, values: np.ndarray) -> tuple[float, AttainmentGoal, float] | None:
-    """Return the relative miss of the worst hard goal, that goal, and its value; None if all are met."""
+    """Return the relative miss of the worst hard goal, that goal, and its value; None if all hard goals are met."""
     worst = None
     for goal, value in zip(problem.goals, values):
         lacking = (value - goal.goal) / max(abs(goal.goal), 1e-3)
@@ -358,7 +377,7 @@ def unmet(problem: ExcitationProblem, values: np.ndarray) -> tuple[float, Attain
 
 
 def stretched(motion: SampledMotion, factor: float) -> SampledMotion:
-    """Return the motion along the same path, `factor` times slower."""
+    """Return the motion along the same path with `factor` times the duration."""
     if factor == 1.0:
         return motion
     velocity = motion.v / factor
@@ -375,7 +394,9 @@ def _by_variables(
     factor: float,
     by_duration: np.ndarray,
 ) -> np.ndarray:
-    """Return gradients (m, p) by (x, factor): d v/d factor = -v / factor, and so on."""
+    """Return gradients (m, p) by (x, factor) from slopes (m, 4, N, n) in q, v, a, jerk; d v/d factor = -v / factor,
+    etc.
+    """
     powers = factor ** np.arange(4)
     in_family_time = slopes
     if factor != 1.0:

@@ -1,7 +1,7 @@
 """One start's search: sequential quadratic programming on the smoothed problem, sharper from stage to stage.
 
-The first stage looks at half of the samples, and at motions of few harmonics where the problem names a coarser family:
-most of the way costs a fraction there. The best motion that kept all constraints at the samples is returned, not the
+The first stage uses half of the samples and, where the problem names a coarser family, motions of few harmonics: most
+progress costs a fraction in this way. The result is the best motion that kept all constraints at the samples, not the
 last one.
 """
 
@@ -24,9 +24,15 @@ Method = Literal["slsqp", "auglag", "mma", "ccsaq"]
 
 
 class Stage(NamedTuple):
-    """Stage of a search: sharpness p of spectra and ρ of constraints, SLSQP's tolerance, share of evaluations.
+    """Stage of a search.
 
-    Rough: at half of the samples; coarse: in the coarse family.
+    Attributes:
+        spectra: sharpness p of the spectra.
+        constraints: sharpness ρ of the constraints.
+        tolerance: SLSQP's tolerance.
+        share: share of the evaluations.
+        rough: half of the samples are used.
+        coarse: the coarse family is used.
     """
 
     spectra: float
@@ -61,15 +67,17 @@ class SearchResult:
     """Result of a search.
 
     Attributes:
-        x: variables of the family; `factor` multiplies its period.
+        x: (p,) variables of the family.
+        factor: factor on the family's period.
         merit: the weighted sum, or γ.
-        values: (k,) of the objectives or goals, not smoothed, at the problem's samples.
+        values: (k,) unsmoothed objectives or goals at the problem's samples.
         history: merits of the improving feasible iterates, falling.
-        evaluations: of everything, with gradients.
-        feasible: share of them that kept all constraints at the samples.
-        seconds: it took.
-        seed: of its start; `interrupted`: ended by Ctrl-C.
-        times: of the history, processor seconds since its start.
+        evaluations: number of evaluations of constraints and merit.
+        feasible: share of the evaluations that kept all constraints at the samples.
+        seconds: wall-clock time of the search [s].
+        seed: number of the random start; −1 for a given start.
+        interrupted: True after Ctrl-C.
+        times: processor time [s] since the search began, for each entry of `history`.
     """
 
     x: np.ndarray
@@ -90,9 +98,10 @@ class Stuck:
     """Result of a search that found no feasible motion.
 
     Attributes:
-        x, factor: of the motion that broke the constraints least.
-        excess: of its constraints over their scales, and of its hard goals over theirs.
-        evaluations: what the search cost; `reason`: why the optimiser ended, where it says so.
+        x, factor: variables and factor on the period of the motion that broke the constraints least.
+        excess: its largest excess over the constraints, and over the hard goals, each relative to their scale.
+        evaluations: number of evaluations of the search.
+        reason: why the optimiser ended, empty where it gives no reason.
     """
 
     x: np.ndarray
@@ -110,14 +119,23 @@ def one_start(
     start: int | np.ndarray,
     stages: tuple[Stage, ...] = STAGES,
 ) -> SearchResult | Stuck:
-    """Search from one random start (its number) or from given variables.
+    """Search from one random start (its number) or from given variables (p,).
 
-    Where the best motion of a stage breaks a limit between the samples by more than `max_break`, the stage goes on with
-    the instants where that was, from there or, where that cannot be repaired, from the last motion that did not.
+    Where the best motion of a stage breaks a limit between the samples by more than a share of its scale, the stage is
+    repeated with those instants as extra times, from that motion or, where it cannot be repaired, from the last motion
+    that
+    keeps the limits.
 
     Args:
-        evaluations: most, if all of `STAGES` are gone through.
-        stages: those to go through, a given start with the whole family in all of them.
+        problem: the problem.
+        evaluations: largest number of evaluations over all of `STAGES`.
+        method: see `calib.trajectories.design.optimise.design`.
+        seed: seed of the random start.
+        start: number of the random start, or variables to start from.
+        stages: the stages to run; given variables are never searched in the coarse family.
+
+    Returns:
+        The result, or a `Stuck` where no motion kept the constraints.
     """
     began = time.perf_counter()
     random = isinstance(start, int | np.integer)
@@ -170,7 +188,7 @@ def one_start(
 
 
 def _at_stage(problem: ExcitationProblem, stage: Stage, extra: np.ndarray) -> tuple[ExcitationProblem, Basis]:
-    """Return the problem of a stage, with extra times, and its basis."""
+    """Return the problem as a stage sees it (samples, family), with `extra` times [s], and its basis."""
     problem = replace(problem, extra=extra)
     if stage.rough:
         problem = replace(problem, samples=max(8, problem.samples // 2))
@@ -180,7 +198,7 @@ def _at_stage(problem: ExcitationProblem, stage: Stage, extra: np.ndarray) -> tu
 
 
 class StartSearch:
-    """One start's search in one problem: the state that the optimiser's callbacks share."""
+    """One start's search in one problem: the state shared by the optimiser's callbacks."""
 
     def __init__(self, problem: ExcitationProblem, basis: Basis):
         self.problem = problem
@@ -212,13 +230,15 @@ class StartSearch:
         return last
 
     def broken(self, y: np.ndarray) -> np.ndarray:
-        """Return the times of a motion that breaks limits between samples by more than `max_break`; empty if none."""
+        """Return times [s] at which a motion breaks limits between samples by more than `max_break`; empty if none."""
         # of a constraint's scale: a motion that breaks it by more between the samples leads nowhere (our choice)
         max_break = 0.02
         return critical_times(self.problem, y, max_break)
 
     def last_unbroken(self) -> np.ndarray:
-        """Return the last improving point within limits between samples, by bisection; the first one if none is."""
+        """Return the last improving point that keeps the limits between samples, by bisection; the first point if none
+        does.
+        """
         low, high = 0, len(self._trail) - 1
         while high - low > 1:
             middle = (low + high) // 2
@@ -229,7 +249,7 @@ class StartSearch:
         return self._trail[low]
 
     def continued(self, y: np.ndarray, problem: ExcitationProblem, basis: Basis) -> tuple[StartSearch, np.ndarray]:
-        """Return the search of another problem continued from y, and its start point."""
+        """Return the search continued in another problem, and the point y expressed in that problem's variables."""
         if problem.family is not self.problem.family:
             p = self.basis.p
             path = self.problem.family.basis(basis.times).motion(y[:p])
@@ -245,7 +265,7 @@ class StartSearch:
         return new, y
 
     def result(self, y: np.ndarray, seconds: float, seed: int) -> SearchResult | Stuck:
-        """Return the result of the search; y: its last point."""
+        """Return the result of the search, which ended at the point y after `seconds` [s]."""
         p = self.basis.p
         stretch = self.problem.stretch
         best = self.reached(y)
@@ -276,7 +296,7 @@ class StartSearch:
         )
 
     def at(self, y: np.ndarray) -> Evaluation:
-        """Return the evaluation of a point, computed once; remember the best feasible one."""
+        """Return the evaluation of a point, computed once; the best feasible point is remembered."""
         key = (y.tobytes(), self.sharpness)
         if self._evaluation is None or key != self._at:
             self._evaluation = evaluate(self.problem, self.basis, y, self.sharpness)
@@ -286,7 +306,7 @@ class StartSearch:
         return self._evaluation
 
     def remember(self, y: np.ndarray, evaluation: Evaluation) -> None:
-        """Keep an evaluated motion if it is within the limits and the best so far, or the nearest to the limits."""
+        """Remember a point if it keeps the limits and is the best so far, or if it breaks them least so far."""
         missed = None
         if self.problem.goals:
             missed = unmet(self.problem, evaluation.values)
@@ -309,7 +329,7 @@ class StartSearch:
             self.times.append(time.process_time() - self.began)
 
     def inside(self, y: np.ndarray) -> np.ndarray:
-        """Return a point that keeps the constraints: repaired, or of a smaller motion if that fails."""
+        """Return a point that keeps the constraints: y repaired, or a smaller motion where that fails."""
         evaluation = self.repaired(y)
         max_halvings = 4  # times that a motion is halved which cannot be brought back inside
         for _ in range(max_halvings):
@@ -320,7 +340,7 @@ class StartSearch:
         return evaluation
 
     def repaired(self, y: np.ndarray, evaluations: int = 80) -> np.ndarray:
-        """Return a point that meets the constraints, or the nearest point found: min Σ max(0, c + 0.01)² by L-BFGS."""
+        """Return a point that keeps constraints, or the last one of the repair: min Σ max(0, c + 0.01)² by L-BFGS."""
         if not self.problem.constraints or self.at(y).constraints.max() <= 0:
             return y
 
@@ -339,7 +359,7 @@ class StartSearch:
         return self._optimised(solver, y)
 
     def solve(self, y: np.ndarray, evaluations: int, method: Method, tolerance: float = 1e-5) -> np.ndarray:
-        """Solve the smoothed problem from y (with goals followed by s, γ = e^s - 1)."""
+        """Return the optimiser's last point y for the smoothed problem; with goals it also varies s, γ = e^s - 1."""
         goals = self.problem.goals
         if goals:
             start = np.append(y, self._attainment(y))
@@ -374,7 +394,10 @@ class StartSearch:
         return len(self.at(np.ascontiguousarray(y)).constraints) + len(self.problem.goals)
 
     def _by_scipy(self, start: np.ndarray, last: int, tolerance: float) -> np.ndarray:
-        """Run SciPy's SLSQP (Kraft 1988) up to `last` evaluations; its subproblems are solved faster than in NLopt."""
+        """Return the last point of SciPy's SLSQP (Kraft 1988), run until the search has made `last` evaluations.
+
+        Its subproblems are solved faster than in NLopt.
+        """
         self._tried = start
         goal_variables = bool(self.problem.goals)
         rows = self._count(start[: len(start) - goal_variables])
@@ -433,7 +456,9 @@ class StartSearch:
         return run.x
 
     def _ends(self, size: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return bounds of the factor on the period and of s (γ from -0.98 to 10⁵); steps are not limited."""
+        """Return the bounds of all variables: of the factor on the period, and of s (γ from -0.98 to 10⁵); x is not
+        bounded.
+        """
         lower = np.full(size, -np.inf)
         upper = np.full(size, np.inf)
         p = self.basis.p

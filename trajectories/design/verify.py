@@ -1,9 +1,10 @@
 """Final check of feasibility: a motion evaluated anew, densely, with an allowance between the samples.
 
-Positions and derivatives come from the family's own formula, not from the optimiser's tables. Between two instants dt
-apart a function rises above both by at most max|f''| dt² / 8. For limits on d^r q / dt^r that maximum is bounded by the
-coefficients (*proved*); for torques, places and distances it is estimated as twice the second difference on the spot
-(*estimated*: our choice; a jump between two instants, as of Coulomb friction, needs no allowance beyond it).
+Positions and derivatives come from the family's formula, not from the optimiser's tables. Between two instants dt
+apart a function rises above its values at both by at most max|f''| dt² / 8. For limits on d^r q / dt^r that maximum is
+bounded by the coefficients (*proved*); for torques, positions and distances it is estimated as twice the second
+difference at that instant (*estimated*: our choice; a jump between two instants, as of Coulomb friction, needs no
+further allowance).
 """
 
 from collections.abc import Sequence
@@ -24,12 +25,12 @@ class Margin:
     """Margin to one limit.
 
     Attributes:
-        name, label, unit: of the constraint and of its column.
-        margin: least distance to the limit over all times [unit], the allowance taken off; negative: broken.
-        share: the same over the constraint's scale.
-        time: where [s].
-        allowance: for what lies between the instants [unit].
-        proved: whether the allowance is a bound or an estimate.
+        name, label, unit: name of the constraint, label of the column, unit of the values.
+        margin: least distance to the limit over all times, minus the allowance [unit]; negative: broken.
+        share: margin over the constraint's scale.
+        time: time of the least distance [s].
+        allowance: largest excess that is possible between the instants [unit].
+        proved: True where the allowance is a bound, False where it is an estimate.
     """
 
     name: str
@@ -47,7 +48,8 @@ class Verification:
     """Margins to all constraints, column by column.
 
     Attributes:
-        instants: how many were looked at over the period.
+        margins: one per column of every constraint.
+        instants: number of instants checked over the period.
         rest: largest velocity and acceleration at the start [per s, per s²].
     """
 
@@ -79,7 +81,7 @@ def dense_motion(family: Family, x: np.ndarray, times: np.ndarray, factor: float
 def verify_motion(
     family: Family, x: np.ndarray, constraints: Sequence[MotionConstraint], *, factor: float = 1.0, instants: int = 5000
 ) -> Verification:
-    """Check a motion against constraints at `instants` over one period, and between them.
+    """Return the margins of a motion to constraints at `instants` over one period, and between them.
 
     Args:
         factor: on the family's period.
@@ -103,7 +105,12 @@ def ensured(
     instants: int = 5000,
     rounds: int = 4,
 ) -> tuple[SearchResult, Verification]:
-    """Return a motion that passes `verify_motion`.
+    """Return a motion that passes `verify_motion`, and its verification.
+
+    A motion that does not pass is searched again from its variables, with the instants near the broken limits as extra
+    times, and with more tightening of these limits. Where that does not help, the motion is made smaller about its pose
+    that
+    is furthest inside the limits.
 
     One that does not is searched again from there, with the instants near what it breaks, and further inside the limits
     that it breaks. Where that does not help, it is made smaller about its pose that is furthest inside.

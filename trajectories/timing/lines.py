@@ -1,12 +1,12 @@
-"""Straight tool lines as joint paths, by inverse kinematics along the line. Knows no robot: callables in, a path out.
+"""Straight tool lines as joint paths, by inverse kinematics along the line; the robot enters by callables only.
 
 The tool's position is linear in σ = 0 … 1, its orientation turns about one axis (R = R_0 exp(σ log(R_0ᵀ R_1))). At each
-sample damped least squares (Wampler 1986; Nakamura & Hanafusa 1986) meets the pose, and J's null space pulls to the
-posture at the start:
+sample damped least squares (Wampler 1986; Nakamura & Hanafusa 1986) meets the pose, and a term in J's null space draws
+the arm to the posture at the start:
 
     Δq = J⁺ e + (1 - J⁺ J)(q_start - q),    J⁺ = Jᵀ (J Jᵀ + λ² 1)⁻¹,    e = [Δp; Δφ]
 
-iterated until both are at rest, so that q is a smooth function of σ. A quintic spline joins the samples; they are made
+iterated until Δq vanishes, so that q is a smooth function of σ. A quintic spline joins the samples; they are made
 denser until the tool keeps to the line between them.
 """
 
@@ -39,16 +39,18 @@ class _Line:
 
 
 def line(forward: Forward, jacobian: Forward, start: np.ndarray, goal: np.ndarray) -> _Line:
-    """Return the joint path of a straight tool line from the tool pose at `start` to the pose `goal`.
+    """Return the joint path of a straight tool line from the tool pose at `start` to the pose `goal`, with its
+    deviation.
 
     Args:
-        forward: q (m, n) to tool poses (m, 4, 4).
+        forward: q (m, n) to tool poses T_base_tool (m, 4, 4).
         jacobian: q (m, n) to (m, 6, n), [v; ω] of the tool in the base frame.
         start: (n,) joint values [rad or m].
-        goal: (4, 4).
+        goal: (4, 4) tool pose at the end.
 
     Raises:
-        NothingFeasible: where the line leaves what the arm can reach: how far along it, by how much.
+        BadInput: both ends have one tool pose.
+        NothingFeasible: a pose of the line is out of reach; the message says how far along and by how much.
     """
     start = np.asarray(start, dtype=float)
     first = forward(start[None])[0]
@@ -95,7 +97,9 @@ def _follow(forward: Forward, jacobian: Forward, start: np.ndarray, targets: np.
 
 
 def _reach(forward: Forward, jacobian: Forward, q: np.ndarray, remaining: np.ndarray, target: np.ndarray):
-    """Return joint values (n,) at a target pose and the remaining error (6,)."""
+    """Return joint values (n,) at a target pose (4, 4), near the posture `remaining` (n,), and the remaining error
+    (6,).
+    """
     error = np.full(6, np.inf)
     max_step = 0.2  # [rad or m] of a step of any joint
     for _ in range(STEPS):
@@ -128,7 +132,7 @@ def _targets(first: np.ndarray, goal: np.ndarray, share: np.ndarray) -> np.ndarr
 
 
 def _error(poses: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Return [Δp; Δφ] (m, 6) in the base frame, from poses to targets."""
+    """Return the errors [Δp; Δφ] (m, 6) [m and rad] from poses to targets (m, 4, 4), in the base frame."""
     rotations = targets[:, :3, :3] @ poses[:, :3, :3].transpose(0, 2, 1)
     turn = Rotation.from_matrix(rotations).as_rotvec()
     shift = targets[:, :3, 3] - poses[:, :3, 3]

@@ -21,7 +21,7 @@ class Path:
 
     Attributes:
         derivative: (s (N,), order) to (N, n), d^order Φ / ds^order [rad or m per s^order], order 0 to 2.
-        knots: (K,) from 0 to the length, between which Φ is smooth.
+        knots: (K,) path parameters from 0 to the length; Φ is smooth between neighbouring knots.
     """
 
     derivative: Callable[[np.ndarray, int], np.ndarray]
@@ -49,15 +49,15 @@ class Path:
 
 
 def spline(waypoints: np.ndarray, spacing: np.ndarray | None = None, scale: np.ndarray | None = None) -> Path:
-    """Return the natural cubic spline (C²) through waypoints; the straight line for two.
+    """Return the natural cubic spline (C²) through waypoints; for two waypoints the straight line.
 
     Args:
         waypoints: (m, n) joint values [rad or m], two or more.
-        spacing: (m - 1,) factors on the chord lengths between knots: the shape's own parameters; None: ones.
-        scale: (n,) what counts as one unit of each joint in the chord length; None: ones.
+        spacing: (m - 1,) factors on the chord lengths between knots, which change the shape of the path; None: ones.
+        scale: (n,) length of each joint that counts as 1 in the chord length; None: ones.
 
     Raises:
-        BadInput: for fewer than two waypoints, equal neighbours, or values that are no numbers.
+        BadInput: fewer than two waypoints, equal neighbours, or values that are not numbers.
     """
     points = checked(waypoints)
     steps = np.diff(points, axis=0)
@@ -103,10 +103,16 @@ def checked(waypoints: np.ndarray) -> np.ndarray:
 
 
 def check_within(path: Path, lower: np.ndarray, upper: np.ndarray, waypoints: np.ndarray | None = None) -> np.ndarray:
-    """Return the path's margin (n,) to the nearer joint limit [rad or m]; refuse a path beyond a limit.
+    """Return the path's margin (n,) to the nearer joint limit [rad or m].
+
+    Args:
+        path: the path.
+        lower, upper: (n,) joint limits [rad or m].
+        waypoints: (m, n) waypoints to name in the message; None where the path has none.
 
     Raises:
-        BadInput: naming the waypoint or the place of the path beyond a limit, the joint, and by how much.
+        BadInput: the path exceeds a limit; the message names the waypoint or the part of the path, the joint and the
+            excess.
     """
     for k, point in enumerate(() if waypoints is None else waypoints):
         excess = np.maximum(point - upper, lower - point)
@@ -130,7 +136,7 @@ def check_within(path: Path, lower: np.ndarray, upper: np.ndarray, waypoints: np
 
 
 def extremes(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Return the path parameters of each joint's minimum and maximum, and the values there, two arrays (2, n)."""
+    """Return the path parameters of each joint's minimum and maximum, and the joint values there, two arrays (2, n)."""
     spans = len(path.knots) - 1
     samples = 40  # samples per knot interval where extremes are looked for
     positions = np.linspace(0, spans, samples * spans + 1)

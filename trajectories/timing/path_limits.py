@@ -9,7 +9,7 @@ from ..errors import BadInput
 
 
 class Law(Protocol):
-    """Interface of a robot's dynamics, see `calib.dynamics.path_dynamics.PathDynamics`; arrays (N, n)."""
+    """Interface of a robot's dynamics along a path, see `calib.dynamics.path_dynamics.PathDynamics`; arrays are (N, n)."""
 
     def along(
         self, q: np.ndarray, slope: np.ndarray, curvature: np.ndarray
@@ -23,8 +23,12 @@ class TimingLimits:
     """Limits on absolute values (n,), each above zero; infinite for no limit.
 
     Attributes:
-        velocity, acceleration: [rad/s or m/s, and per s].
+        velocity: [rad/s or m/s].
+        acceleration: [rad/s² or m/s²].
         torque: [N m or N].
+
+    Raises:
+        BadInput: a limit that is not above zero, or not one per joint.
     """
 
     velocity: np.ndarray

@@ -67,9 +67,9 @@ class Sampled:
     """A motion along a path, sampled densely.
 
     Attributes:
-        s: (N,) the places.
-        weights: (N,) seconds that each stands for; they sum to the duration.
-        q, v, a, tau: (N, n); tau None without a law of torques.
+        s: (N,) path parameters of the samples.
+        weights: (N,) duration that each sample represents [s]; they sum to the duration of the motion.
+        q, v, a, tau: (N, n) joint values, velocities, accelerations, torques; tau is None without a torque law.
     """
 
     s: np.ndarray
@@ -81,9 +81,9 @@ class Sampled:
 
 
 def dense(path: Path, profile: Profile, torque: TorqueLaw | None, per_interval: int = 8) -> Sampled:
-    """Return a profile sampled on each interval with both ends: s̈ and the friction's sign jump between intervals.
+    """Return the motion of a profile, sampled on each interval with both ends: s̈ and friction jump between intervals.
 
-    At rest friction takes the direction of the motion that begins or ends there: the larger torque.
+    At rest friction takes the direction of the motion that begins or ends there, which gives the larger torque.
     """
     share = np.linspace(1e-6, 1 - 1e-6, per_interval)
     steps = np.diff(profile.s)[:, None]
@@ -105,7 +105,7 @@ def dense(path: Path, profile: Profile, torque: TorqueLaw | None, per_interval: 
 
 
 def moved(path: Path, s: np.ndarray, speed: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the motion q = Φ, v = Φ' ṡ, a = Φ' s̈ + Φ'' ṡ², each (N, n)."""
+    """Return joint values, velocities and accelerations q = Φ, v = Φ' ṡ, a = Φ' s̈ + Φ'' ṡ², each (N, n)."""
     slope = path(s, 1)
     velocity = slope * speed[:, None]
     acceleration = slope * u[:, None] + path(s, 2) * (speed**2)[:, None]
@@ -113,7 +113,7 @@ def moved(path: Path, s: np.ndarray, speed: np.ndarray, u: np.ndarray) -> tuple[
 
 
 def track(path: Path, profile: Profile, rate: float, torque: TorqueLaw | None = None) -> Setpoints:
-    """Return the motion at a controller's rate [Hz]; its duration must be a whole number of samples.
+    """Return the motion as setpoints at a controller's rate [Hz]; its duration must be a whole number of samples.
 
     Torques at rest are those just after the start and just before the end.
     """

@@ -1,7 +1,7 @@
-"""The convex step of timing: rows a u + b x + c within limits on every interval, and the fastest profile within.
+"""The convex step of timing: rows a u + b x + c within limits on every interval, and the fastest profile within them.
 
-Controllable speeds come from toppra (Pham & Pham 2018), imported at the first call; the pass forward is our own, since
-on two variables with x given it is the smallest of a few quotients, and toppra's gives away 1e-4 of x at every step.
+Controllable speeds come from toppra (Pham & Pham 2018), imported at the first call. The forward pass is our own: with x
+given, the largest u is the smallest of a few quotients, whereas toppra's forward pass loses 1e-4 of x at every step.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from ..timing.profile import Profile
 
 @dataclass(frozen=True, eq=False)
 class _Bounded:
-    """Rows |a u + b x + c| ≤ 1 for each of K intervals, both ends, and 0 ≤ x ≤ top.
+    """Rows |a u + b x + c| ≤ 1 at both ends of each of K intervals, and 0 ≤ x ≤ top.
 
     Attributes:
         a, b, c: (2, K, m) at the left and the right end; x at the right end is x + 2 Δ u.
-        top: (K + 1,).
+        top: (K + 1,) largest x at the grid points.
     """
 
     a: np.ndarray
@@ -36,13 +36,13 @@ class _Bounded:
 
 @dataclass(frozen=True, eq=False)
 class ConstraintRows:
-    """Constraint rows that stay the same in all iterations.
+    """Geometry, dynamics and limits on a grid, which do not change between the iterations.
 
     Attributes:
         s: (K + 1,) the grid.
-        q, slope, curvature: (2, K, n) at both ends of the intervals.
-        A, B, G: (2, K, n) the dynamics there; zero without.
-        limits: see `calib.trajectories.timing.time_scaling.Limits`.
+        q, slope, curvature: (2, K, n) Φ, Φ', Φ'' at both ends of the intervals.
+        A, B, G: (2, K, n) torque by s̈, torque by ṡ², and gravity torque at both ends; zero without dynamics.
+        limits: limits of velocity, acceleration and torque.
     """
 
     s: np.ndarray
@@ -72,7 +72,7 @@ class ConstraintRows:
         return cls(s, q, slope, curvature, A, B, G, limits)
 
     def speed(self, fastest_joint: float) -> float:
-        """Return the x = ṡ² up to which no joint exceeds a speed [rad/s or m/s] anywhere."""
+        """Return the x = ṡ² up to which no joint exceeds the speed `fastest_joint` [rad/s or m/s] anywhere."""
         steepest = np.abs(self.slope).max()
         return (fastest_joint / steepest) ** 2
 
@@ -87,11 +87,11 @@ class ConstraintRows:
         return np.minimum(np.minimum(by_left, by_right), self.speed(max_speed))
 
     def bounded(self, friction: tuple[np.ndarray, np.ndarray], tight: Mapping[str, np.ndarray]) -> _Bounded:
-        """Return the rows as shares of the limits.
+        """Return the rows divided by the limits.
 
         Args:
-            friction: slope and value (2, K, n) of friction as a line in x.
-            tight: (K, n) by kind of limit, the share of it that may be used on each interval.
+            friction: slope and value (2, K, n) of friction as a linear function of x.
+            tight: kind of limit to the share of it (K, n) that may be used on each interval.
         """
         pushing = np.isfinite(self.limits.torque)
         turning = np.isfinite(self.limits.acceleration)
@@ -110,12 +110,13 @@ class ConstraintRows:
     def friction(
         self, law: Law | None, x: np.ndarray | None, before: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return friction linearised in x: slope and value at x = 0, each (2, K, n).
+        """Return friction linearised in x: slope and value at x = 0, each (2, K, n); zeros without dynamics.
 
         Args:
+            law: the robot's dynamics; None: none.
             x: (K + 1,) the profile of the last round; None: friction at a creeping speed.
-            before: the profile of the round before that; where both agree, the line is the tangent at x, elsewhere and
-                for None the secant from creeping to x, which at rest never asks for more than friction does.
+            before: the profile of the round before the last. Where both profiles agree, the line is the tangent at x;
+                elsewhere, and for None, it is the secant from creeping to x, which at rest never exceeds friction.
         """
         if law is None:
             return np.zeros_like(self.q), np.zeros_like(self.q)
@@ -154,10 +155,10 @@ class ConstraintRows:
 
 
 def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
-    """Return the fastest speed profile from rest to rest.
+    """Return the fastest speed profile from rest to rest within the rows.
 
     Raises:
-        NothingFeasible: where no speed can be kept from some grid point on.
+        NothingFeasible: from some grid point on no speed keeps the limits, or the motion stops on the way.
     """
     controllable = _controllable(rows, s)
     if not np.isfinite(controllable).all():
@@ -186,7 +187,7 @@ def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
 
 
 def _largest(rows: _Bounded, k: int, x: float, step: float) -> float:
-    """Return the largest u on interval k at speed x."""
+    """Return the largest path acceleration u on interval k, which begins at x = ṡ² and is `step` long."""
     right = rows.a[1, k] + 2 * step * rows.b[1, k]
     a = np.concatenate([rows.a[0, k], right])
     left_constant = rows.b[0, k] * x + rows.c[0, k]
@@ -200,9 +201,10 @@ def _largest(rows: _Bounded, k: int, x: float, step: float) -> float:
 
 
 def _controllable(rows: _Bounded, s: np.ndarray) -> np.ndarray:
-    """Return the largest x (K + 1,) at each grid point from which the path's end can be reached at rest; NaN if none.
+    """Return the largest x (K + 1,) at each grid point from which the path's end can be reached at rest; NaN if there
+    is none.
 
-    u and x are handed over in units of a typical x, without which the linear programs fail where speeds are large.
+    u and x are passed to toppra in units of a typical x; otherwise its linear programs fail where speeds are large.
     """
     try:
         from toppra.algorithm import TOPPRA
@@ -229,7 +231,7 @@ def _controllable(rows: _Bounded, s: np.ndarray) -> np.ndarray:
 
 
 class _Interval:
-    """Path interface for toppra, with given constraints."""
+    """The interval of path parameters in the form of a path that toppra accepts."""
 
     dof = 1
 

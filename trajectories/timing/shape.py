@@ -1,9 +1,11 @@
-"""Outer optimisation: path parameters φ for a shorter time, with fixed waypoints.
+"""Outer optimisation: path parameters φ for a shorter duration, with fixed waypoints.
 
-A spline through m waypoints has freedom left: the spacing of its knots (m - 2 ratios), and a via point in the middle of
-each interval that may leave the first spline by `stray` (n each). The duration is continuous in φ but not smooth, since
-which limit is active changes; the search goes by linear models over a simplex (Powell 1994, nlopt's COBYLA: of three
-tried it took the fewest evaluations for what it found). Where velocity limits rule, a few percent are there to be had.
+A spline through m waypoints can still change by the spacing of its knots (m - 2 ratios), and by a via point in the
+middle
+of each interval that may leave the first spline by `stray` (n each). The duration is continuous in φ but not smooth,
+since the active limit changes; the search uses linear models over a simplex (Powell 1994, nlopt's COBYLA: of three
+methods tried it needed the fewest evaluations for its result). Where velocity limits are active, a few percent can be
+gained.
 """
 
 from collections.abc import Callable
@@ -22,13 +24,14 @@ Timer = Callable[[Path], float]
 
 @dataclass(frozen=True, eq=False)
 class Shaped:
-    """Result of the search for a shorter path.
+    """Result of the search for a path of shorter duration.
 
     Attributes:
         path: the fastest path.
         phi: (p,) its parameters, each from -1 to 1.
-        before, after: durations [s] of φ = 0 and of `path`.
-        evaluations: paths timed; `refused`: how many of them had no timing within the limits.
+        before, after: durations [s] at φ = 0 and of `path`.
+        evaluations: number of paths timed.
+        refused: number of these paths without a timing within the limits.
     """
 
     path: Path
@@ -49,7 +52,7 @@ def count(waypoints: np.ndarray, stray: float) -> int:
 
 
 def build(waypoints: np.ndarray, phi: np.ndarray, stray: float = 0.0) -> Path:
-    """Return the path of parameters φ: log ratios of knot intervals, then offsets of the via points over `stray`."""
+    """Return path of parameters φ: log ratios of knot intervals, then the via points' offsets as shares of `stray`."""
     points = checked(waypoints)
     m, n = points.shape
     ratios = np.asarray(phi)[: m - 2]
@@ -73,12 +76,17 @@ def shorten(
     stray: float = 0.0,
     progress: Callable[[int, float], None] | None = None,
 ) -> Shaped:
-    """Return the fastest path through the waypoints after at most the given number of evaluations.
+    """Return the fastest path through the waypoints after at most `evaluations` timed paths.
 
     Args:
+        waypoints: (m, n) joint values [rad or m].
         timer: duration [s] of a path; raises `NothingFeasible` or `BadInput` where it has none.
-        stray: how far a via point may leave the first spline [rad or m]; 0 for none.
-        progress: called with evaluations and the best duration; Ctrl-C keeps the best so far.
+        evaluations: largest number of paths timed.
+        stray: how far a via point may leave the first spline [rad or m]; 0 for no via points.
+        progress: called with the number of evaluations and the best duration; Ctrl-C keeps the best until then.
+
+    Raises:
+        BadInput: negative `stray`, or no evaluations.
     """
     import nlopt
 

@@ -2,15 +2,17 @@
 
     |Φ' ṡ| ≤ v_max,    |Φ' s̈ + Φ'' ṡ²| ≤ a_max,    |A s̈ + B ṡ² + Γ + f(Φ, Φ' ṡ)| ≤ τ_max
 
-With u = s̈, x = ṡ² all is affine but friction f (Bobrow, Dubowsky, Gibson 1985). It is replaced by a line in x that
-meets it at the profile x_k of the round before: the secant from rest where rounds differ much (feasible from any x_k,
-and for viscous friction it halves the error of log x), else the tangent (Newton's step). A plain fixed point, which
-holds f, runs away where friction itself limits the speed. Each round is solved by reachability (Pham & Pham 2018,
-toppra): backwards the controllable speeds, forwards the largest acceleration. Rows of an interval stand for both of its
-ends (interpolation scheme), with friction's direction inside the interval.
+With u = s̈, x = ṡ² all terms are affine but friction f (Bobrow, Dubowsky, Gibson 1985). Friction is replaced by a line
+in
+x that meets it at the profile x_k of the round before: the secant from rest where rounds differ much (feasible from any
+x_k, and for viscous friction it halves the error of log x), else the tangent (Newton's step). A plain fixed point, with
+f constant in a round, diverges where friction itself limits the speed. Each round is solved by reachability (Pham &
+Pham
+2018, toppra): backwards the controllable speeds, forwards the largest acceleration. Rows of an interval are taken at
+both of its ends (interpolation scheme), with friction's direction inside the interval.
 
-What comes out is held against the full inverse dynamics between the grid points; where a limit is crossed there, it is
-tightened on that interval by the excess and the path is timed again, until none is.
+The result is checked by the full inverse dynamics between the grid points; where it crosses a limit, that limit is
+tightened on that interval by the excess and the path is timed again, until no limit is crossed.
 """
 
 from dataclasses import dataclass, field, replace
@@ -39,9 +41,11 @@ class Timing:
     """A timed path with its torques and limits.
 
     Attributes:
-        path, profile, limits: what moves, how fast, within what.
-        sampled: the motion between the grid points too, with full inverse dynamics.
-        iterations: rounds of reachability.
+        path: the path.
+        profile: the speed along it.
+        limits: the limits of velocity, acceleration and torque.
+        sampled: the motion, between the grid points too, with full inverse dynamics.
+        iterations: number of rounds of reachability.
         tightened: largest share by which a limit was narrowed to keep it between the grid points.
         history: durations of the rounds [s].
     """
@@ -65,7 +69,7 @@ class Timing:
 
     @property
     def margins(self) -> dict[str, np.ndarray]:
-        """Margin (n,) to each limit, as a share of it; 1 for no limit."""
+        """Margin (n,) to each kind of limit, as a share of the limit; 1 for a joint without that limit."""
         return {name: 1.0 - values.max(axis=0) for name, values in self.used.items()}
 
     @property
@@ -84,12 +88,17 @@ def time_optimal(
     """Return the fastest motion from rest to rest along a path.
 
     Args:
+        path: the path.
+        limits: limits of velocity, acceleration and torque.
         law: the robot's dynamics; None: kinematic limits alone.
-        rate: of a controller [Hz]: the duration is rounded up to whole samples.
-        grid: intervals on the path; None: see `_grid_points`.
+        rate: sampling rate of a controller [Hz], to whose samples the duration is rounded up; None: no rounding.
+        grid: number of intervals on the path; None: see `_grid_points`.
 
     Raises:
-        NothingFeasible: where the torque limits do not even hold the robot: which joint, where, by how much.
+        BadInput: torque limits without dynamics.
+        NothingFeasible: the torque limits do not hold the robot still or moving slowly (which joint, where, by how
+            much),
+            or the timing does not converge.
     """
     if law is None and np.isfinite(limits.torque).any():
         raise BadInput("torque limits need the robot's dynamics; leave them infinite, or give a model")
@@ -138,7 +147,7 @@ def _timed(path: Path, limits: TimingLimits, law: Law | None, profile: Profile) 
 
 
 def _on_samples(profile: Profile, rate: float | None) -> Profile:
-    """Return a profile that takes a whole number of samples at a rate [Hz]; None: the profile itself."""
+    """Return the profile slowed down to a whole number of samples at a rate [Hz]; for None the profile itself."""
     if rate is None:
         return profile
     return profile.slower(_whole(profile.duration, rate))
@@ -162,7 +171,9 @@ def _per_interval(values: np.ndarray, count: int) -> np.ndarray:
 def _round(
     rows: ConstraintRows, law: Law | None, x: np.ndarray | None, before: np.ndarray | None, tight: dict
 ) -> Profile:
-    """Return the fastest profile with linearised friction; by secants only if tangents make it infeasible."""
+    """Return the fastest profile with friction linearised at the last rounds; by secants if tangents make it
+    infeasible.
+    """
     try:
         bounded = rows.bounded(rows.friction(law, x, before), tight)
         return fastest(bounded, rows.s)
@@ -172,7 +183,7 @@ def _round(
 
 
 def _shares(sampled: Sampled, limits: TimingLimits) -> dict[str, np.ndarray]:
-    """Return the shares of the limits in use, (N, n) each, without kinds of limit that no joint has."""
+    """Return the shares of the limits in use, (N, n) per kind of limit; a kind that no joint has is left out."""
     kinds = (
         ("velocity", sampled.v, limits.velocity),
         ("acceleration", sampled.a, limits.acceleration),
@@ -186,9 +197,9 @@ def _shares(sampled: Sampled, limits: TimingLimits) -> dict[str, np.ndarray]:
 
 
 def _check_holding(path: Path, limits: TimingLimits, law: Law, s: np.ndarray) -> None:
-    """Refuse a path on which the torque limits do not suffice to hold the robot or to move it slowly.
+    """Raise NothingFeasible where the torque limits do not suffice to hold the robot on the path or to move it slowly.
 
-    A motion that swings through such a place can exist; it could not be stopped there, nor rehearsed (our choice).
+    A motion that swings through such a pose can exist; it could not be stopped there, nor rehearsed (our choice).
     """
     slow_speed = np.full(len(s), 1e-9)
     no_acceleration = np.zeros(len(s))
@@ -233,13 +244,13 @@ def _grid_points(path: Path, count: int | None = None) -> np.ndarray:
 
 
 def _whole(duration: float, rate: float) -> float:
-    """Return the factor ≥ 1 that makes a duration a whole number of samples."""
+    """Return the factor ≥ 1 by which a duration [s] becomes a whole number of samples at a rate [Hz]."""
     samples = duration * rate
     return np.ceil(samples - 1e-9) / samples
 
 
 def _not_settled(excess: dict[str, np.ndarray]) -> NothingFeasible:
-    """Return the error on the limit that is exceeded most."""
+    """Return the error that names the limit exceeded most."""
     name = max(excess, key=lambda key: float(excess[key].max()))
     worst = float(excess[name].max())
     by_joint = excess[name].max(axis=0)

@@ -80,11 +80,14 @@ ROUND_RUNNING = 720.0
 
 @dataclass(frozen=True)
 class DemoResult:
-    """Result of the demonstration: the session, its verdict ("" where it stopped), and duration.
+    """Result of the demonstration.
 
     Attributes:
-        asks: what to do now, where it stopped for an engineer.
-        nominal, calibrated: errors against the hidden truth, rms [mm]; NaN where it stopped.
+        session: the session.
+        verdict: verdict of the session; empty where it stopped for an engineer.
+        seconds: wall-clock time [s].
+        asks: instructions to the engineer where it stopped; else empty.
+        nominal, calibrated: rms position errors of both arms against the hidden truth [mm]; NaN where it stopped.
         memory: largest resident set [MB].
     """
 
@@ -113,15 +116,18 @@ def run(
     """Return the result of a session on a simulated robot, compared with its hidden truth.
 
     Args:
-        folder: of the session, to be created.
-        robot: of the library.
-        seed: of the robot's errors, the noise, the pose selection and the motions.
+        folder: the session's folder, to be created.
+        robot: name of a robot of the library.
+        seed: seed of the robot's errors, the noise, the pose selection and the motions.
         say, progress: print a permanent line, and show a transient status.
-        dynamics: identify them, too, where the library knows the robot's masses.
-        guided: stop where an engineer would; `simulate_next` then plays his part.
+        dynamics: whether to identify dynamics too, where the library knows the robot's masses.
+        guided: stop where an engineer has to act; `simulate_next` then simulates that step.
         plots: whether figures are drawn.
         instrument: ``cmm``, or ``camera``, which takes rendered images.
-        verbose: say all that the session says, too.
+        verbose: print the session's messages too.
+
+    Raises:
+        UsageError: an unknown instrument.
     """
     if instrument not in ("cmm", "camera"):
         raise UsageError(f"--instrument {instrument}: expected cmm or camera")
@@ -180,7 +186,7 @@ def _stopped(session: Session, waiting: StepState) -> tuple[str, ...]:
 
 
 def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
-    """Return the tool errors [mm] of nominal and calibrated arm against the truth; say and write all errors."""
+    """Return the rms tool errors [mm] of nominal and calibrated arm against the truth; print and write all errors."""
     cell_fit = read_installation(session.fit.path)
     urdf = read_calibrated(session.fit.path).chain
     before, after, bare = true_position_errors(cell, cell_fit, urdf)
@@ -216,7 +222,7 @@ def simulate_next(folder: Path, say: Say) -> None:
     """Simulate the files that the session in `folder` waits for; compare a finished session with the truth.
 
     Raises:
-        UsageError: where nothing is waited for, or the session's robot is none of the library.
+        UsageError: the session waits for no files, or its robot is not one of the library.
     """
     session = open_session(folder)
     robot = session.settings.robot.given
@@ -236,7 +242,7 @@ def _step_to_simulate(session: Session) -> str:
     """Return the name of the step that waits for files; empty for a finished session.
 
     Raises:
-        UsageError: where a step waits for something else.
+        UsageError: a step waits for something other than files.
     """
     for state in step_states(session):
         if state.kind == WAITING:

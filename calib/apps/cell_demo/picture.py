@@ -38,7 +38,7 @@ def draw(session: Session) -> None:
 
 
 def _seen_from(points: np.ndarray) -> np.ndarray:
-    """Return points (..., 3) [m] as seen from afar: (..., 2), to the right and up."""
+    """Return points (..., 3) [m] projected along the viewing direction: (..., 2), rightwards and upwards [m]."""
     cos_azimuth, sin_azimuth = np.cos(AZIMUTH), np.sin(AZIMUTH)
     cos_elevation, sin_elevation = np.cos(ELEVATION), np.sin(ELEVATION)
     right = [-sin_azimuth, cos_azimuth, 0.0]
@@ -47,7 +47,7 @@ def _seen_from(points: np.ndarray) -> np.ndarray:
 
 
 def _cell(session: Session) -> Panel:
-    """Return the arm at one of its poses, and the errors at all poses before and after, enlarged."""
+    """Return the panel of the arm at one of its poses, with the errors at all poses before and after, enlarged."""
     chain = chain_of(session)
     (measured,) = drawn(session.folder).measured
     scale = measured.arrow_scale(chain)
@@ -68,7 +68,7 @@ def _cell(session: Session) -> Panel:
 
 
 def _errors(session: Session) -> Panel:
-    """Return the histogram of the errors of nominal robot and robot.urdf on unseen poses."""
+    """Return the histogram of the errors of nominal robot and robot.urdf at held-out poses."""
     sets = read_fit_report(session.validation.report).sets
     (unseen,) = (rows for rows in sets if rows.unseen)
     nominal = np.array(unseen.nominal["position"])
@@ -79,7 +79,7 @@ def _errors(session: Session) -> Panel:
 
 
 def _torque(session: Session) -> Panel:
-    """Return the largest joint's torque on the unseen motion: measured, predicted, residual."""
+    """Return the panel of the largest joint torque on the held-out motion: measured, predicted, residual."""
     unseen = session.identification.unseen.read()
     curves = unseen.curves[0]
     t = np.array(curves.t, dtype=float).T

@@ -1,6 +1,6 @@
-"""What the demonstration tells of itself: a line with one number for each step, how far it is, and five files.
+"""The demonstration's output: a line with one number for each step, the progress, and the paths of five files.
 
-In letters that every terminal has, at most 60 of them a line.
+Lines use characters that every terminal has, at most 60 of them.
 """
 
 import time
@@ -32,12 +32,12 @@ SECONDS = {
 
 
 def row(name: str, number: float, meaning: str) -> str:
-    """Return a line of the summary: whose number, the number with three digits, what it is."""
+    """Return a line of the summary: name, number with three digits, its meaning."""
     return f"{name:<11} {number:>6.3g} {meaning}"
 
 
 def _number(session: Session, step: str) -> tuple[float, str] | None:
-    """Return the number of a step and what it is, read from the session's folders; None for steps without one."""
+    """Return a step's number and its meaning, read from the session's folders; None for steps without a number."""
     settings = session.settings
     match step:
         case "describe":
@@ -73,11 +73,13 @@ def _number(session: Session, step: str) -> tuple[float, str] | None:
 
 @dataclass
 class Telling:
-    """Tells of a session as it goes on.
+    """Prints the progress of a session.
 
     Attributes:
+        session: the session.
         say, show: print a permanent line, and show a transient status.
-        verbose: whether all that the session says is told besides.
+        verbose: whether all messages of the session are printed too.
+        began: time at which the session began [s], by `time.perf_counter`.
     """
 
     session: Session
@@ -90,7 +92,7 @@ class Telling:
     _entered: float = 0.0
 
     def said(self, *lines: str) -> None:
-        """Tell what the session says: of a step that is done its line, once, and if verbose all its words."""
+        """Print a session's messages: for a finished step its summary line, once; if verbose, every message."""
         for line in lines:
             step = line.partition(":")[0].rpartition(" ")[2]
             number = _number(self.session, step) if line[:1].isdigit() else None
@@ -103,7 +105,11 @@ class Telling:
                 self.say(f"    - {line.strip()}")
 
     def progress(self, text: str) -> None:
-        """Show the stage, the share done and the time left; `text`: a stage's purpose, or what it does."""
+        """Show the stage, the share done and the time left.
+
+        Args:
+            text: the purpose of a step, which thereby begins, or what the present step does.
+        """
         moment = time.perf_counter()
         steps = steps_of(self.session)
         names = [step.name for step in steps]
@@ -122,7 +128,7 @@ class Telling:
 
 
 def reasons(session: Session) -> Iterator[str]:
-    """Yield what a verdict other than pass means, and the commands that explain its reasons."""
+    """Yield the meaning of each verdict other than pass, and the commands that explain its reasons."""
     reports: dict[str, ValidationMetrics | UnseenReport] = {"geometry": session.validation.metrics()}
     if session.dynamic:
         reports["dynamics"] = session.identification.unseen.read()
@@ -135,7 +141,7 @@ def reasons(session: Session) -> Iterator[str]:
 
 
 def paths(session: Session) -> list[str]:
-    """Return the five files to look at."""
+    """Return lines with the paths of up to five files to look at."""
     candidates = {
         "session": SETTINGS,
         "certificate": CERTIFICATE,

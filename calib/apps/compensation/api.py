@@ -17,15 +17,17 @@ from calib.toolkit.result_folders import GeometryFit, Progress, Shown, joints_of
 
 
 class JointCommands(Shown, joint_commands.Commands):
-    """Joint commands that move the real tool to nominal targets. ``print`` says what is reached and how well."""
+    """Joint commands that move the real tool to nominal targets. ``print`` shows which targets are reached and the
+    errors.
+    """
 
     tab = "q reached reason left before sigma expected beyond notes save"
 
     @checked
     def save(self, path: str | Path, *, partial: bool = False, overwrite: bool = False) -> Path:
-        """Write the joint commands as CSV; with `partial`, also if some targets were not reached.
+        """Write the joint commands as CSV and return its path; with `partial`, also if some targets were not reached.
 
-        A file that no earlier run left, or that was changed since, is refused unless `overwrite`.
+        A file that no earlier run of calib wrote, or that was changed since, is replaced only with `overwrite`.
         """
         with files.results([(Path(path), (".csv",))], overwrite=overwrite):
             return joint_commands.write(self, Path(path), partial)
@@ -41,7 +43,7 @@ def read_fitted(folder: str | Path) -> joint_commands.Fitted:
     """Return the fitted arm with its instrument and tools from a fit's folder.
 
     Raises:
-        UsageError: where it is none, lacks something, or is of a parallel robot.
+        UsageError: the folder holds no fit, an incomplete one, or that of a parallel robot.
     """
     try:
         return joint_commands.read(folder)
@@ -66,16 +68,21 @@ def compensate(
     """Compute the joint commands that move the real tool to nominal targets.
 
     Args:
-        fitted: a fit, the folder of one, or what was read of it.
+        fitted: a fit, its folder, or the result of `read_fitted`.
         targets: CSV file (``calib formats targets``), targets in memory, or an array: poses (m, 4, 4) [m], or nominal
             joint values (m, n) [rad or m].
-        frame: what the targets are in: ``base`` of the calibrated robot, ``nominal``, or a station's name.
-        tool: what stands there: ``flange``, a tool of the fit, or ``x,y,z[,roll,pitch,yaw]`` [m, rad].
-        dof: how much counts: 6; 5, free to turn about the tool's z; 3, position only; None: as the targets say.
-        start: (n,) joint values [rad or m] near which targets without joints are sought.
-        tolerance: what a command may leave by the calibrated model [m], [rad].
-        seed: of the starts for targets without joints.
-        progress: called with a few words now and then.
+        frame: frame of the targets: ``base`` of the calibrated robot, ``nominal``, or a station's name.
+        tool: what is at the targets: ``flange``, a tool of the fit, or ``x,y,z[,roll,pitch,yaw]`` [m, rad].
+        dof: pose components that count: 6; 5, free to turn about the tool's z; 3, position only; None: all that the
+            targets give and the arm can reach.
+        start: (n,) joint values [rad or m] near which targets without joints are sought; None: the middle of the
+            limits.
+        tolerance: largest accepted residual at a target by the calibrated model [m], [rad].
+        seed: seed of the starts for targets without joints.
+        progress: called with a short text as the computation proceeds; None for no report.
+
+    Raises:
+        UsageError: an unknown frame or tool, an invalid tolerance, or a start beyond the limits.
     """
     if isinstance(fitted, joint_commands.Fitted):
         calibrated = fitted

@@ -83,13 +83,15 @@ class Fitted:
     """Calibrated arm and its cell, read from the folder of a fit.
 
     Attributes:
+        folder: the folder.
         cell: the calibrated installation, deflections included.
-        nominal: the nominal one, placed to fit the same measurements best; without stations if that is unknown.
-        free, covariance: of the fit's parameters, see `read_covariance`.
-        unseen: rms error of the calibrated arm on unseen poses [m]; None without such poses.
-        fitted: rms error on the fitted poses [m].
-        fitted_q: (k, n) joint values of the fitted poses [rad or m], and `discrepancy`: variance model of the error at
-            other poses; None where the fit does not say.
+        nominal: the nominal installation, placed to fit the same measurements best; without stations if that is
+            unknown.
+        free, covariance: fitted parameters and their covariance, see `read_covariance`.
+        unseen: rms error of the calibrated arm at held-out poses [m]; None without such poses.
+        fitted: rms error at the fitted poses [m]; None where the fit does not state it.
+        fitted_q: (k, n) joint values of the fitted poses [rad or m]; None where the fit does not state them.
+        discrepancy: variance model of the error at other poses; None where the fit does not state it.
     """
 
     folder: Path
@@ -114,21 +116,26 @@ class Commands:
     """Joint commands for m targets.
 
     Attributes:
-        targets, fitted: what was asked for, of which robot in its cell.
-        q: (m, n) joint values [rad or m]; for a target that is not reached, as near as the arm came.
-        nominal: (m, n) those of the nominal robot.
-        reached: (m,).
-        reason: (m,) why not; "" where reached.
-        left, before: (m, 2) position [m] and orientation [rad] left at ``q``, and at ``nominal``; NaN for an
-            orientation that does not count.
-        sigma: (m, 2) of position [m] and orientation [rad] at ``q``, from the parameters' covariance.
-        expected: (m, 2) standard deviation of the real tool's position error at ``q`` [m], all that the model leaves
-            included, and the radius within which 95 % of such errors are to be; NaN where the fit does not say.
-        beyond: (m, n) joints outside the range that was measured for the fit; none where that is not known.
-        dof: 6, 5 or 3.
-        notes: which frames were meant, and what is odd.
-        own: (m, 2) of ``before`` what is the arm's own, its base placed where it fits the measurements best; None where
-            ``before`` is that, or where nobody knows.
+        targets: the targets.
+        fitted: the calibrated robot in its cell.
+        q: (m, n) joint values [rad or m]; for a target that is not reached, the nearest that the arm came.
+        nominal: (m, n) joint values of the nominal robot at the targets [rad or m].
+        reached: (m,) True where a target is reached.
+        reason: (m,) why a target is not reached; empty where it is.
+        left, before: (m, 2) position [m] and orientation [rad] errors by the calibrated model at ``q``, and at
+        ``nominal``;
+            NaN for an orientation that does not count.
+        sigma: (m, 2) σ of position [m] and orientation [rad] at ``q``, from the parameters' covariance.
+        expected: (m, 2) standard deviation of the real tool's position error at ``q`` [m], model discrepancy included,
+            and
+            the radius within which 95 % of such errors are expected; NaN where the fit has no error model.
+        beyond: (m, n) True for joints outside the range that was measured for the fit; all False if the range is
+            unknown.
+        dof: pose components that count: 6, 5 or 3.
+        notes: remarks on the frames and on anything unusual.
+        own: (m, 2) part of ``before`` due to the arm alone, its base placed where it fits the measurements best; None
+            where
+            ``before`` is that already, or the part is unknown.
     """
 
     targets: Targets
@@ -148,10 +155,10 @@ class Commands:
 
 
 def read(folder: str | Path) -> Fitted:
-    """Read the folder of a fit, or of a session that contains a fit.
+    """Return the calibrated arm and its cell from the folder of a fit, or of a session that contains a fit.
 
     Raises:
-        UsageError: where it is none, or lacks something.
+        UsageError: the folder holds no fit, or an incomplete one.
     """
     result = open_result(folder, "compensate")
     fit = result.fit
@@ -185,10 +192,10 @@ def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tup
 
     Args:
         fitted: see `read`.
-        frame, tool: as the module says.
+        frame, tool: see the module's docstring.
 
     Raises:
-        UsageError: for a frame or tool that the fit does not have.
+        UsageError: a frame or tool that the fit does not have.
     """
     cell, nominal = fitted.cell, fitted.nominal
     tool_pose = _tool(cell, tool)
@@ -250,22 +257,27 @@ def computed(
 ) -> Commands:
     """Return the joint commands that bring the real tool to the targets.
 
-    The nominal robot says which configuration is meant; from there the calibrated one is led to the target, joints
-    moving as little as they can. Where one would move by more than `MAX_CORRECTION`, the arm is near a singularity:
-    it is held back, and what is left is said.
+    The nominal robot's joint values determine the configuration; from them the calibrated robot is led to the target
+    with
+    the smallest joint motion. Where a joint would move by more than `MAX_CORRECTION`, the arm is near a singularity:
+    the
+    joint is held back, and the remaining error is reported.
 
     Args:
         fitted: see `read`.
         targets: joints or poses.
-        frame, tool: as the module says.
-        dof: how much of a pose counts, see `calib.geometry.inverse.Goal`; None for all that the targets say and the arm
-            can do.
-        start: (n,) where a target without joints is sought from [rad or m]; None for the middle of the limits.
-        tolerance: position [m] and orientation [rad] that a command may leave.
-        seed: of further starts, where the first one fails.
+        frame, tool: see the module's docstring.
+        dof: pose components that count, see `calib.geometry.inverse.Goal`; None for all that the targets give and the
+            arm
+            can reach.
+        start: (n,) joint values near which targets without joints are sought [rad or m]; None for the middle of the
+            limits.
+        tolerance: largest accepted residual of position [m] and orientation [rad].
+        seed: seed of further starts, where the first one fails.
+        progress: called with a short text as the computation proceeds; None for no report.
 
     Raises:
-        UsageError: for a tolerance that is none, and a start beyond the limits.
+        UsageError: an invalid tolerance, or a start beyond the limits.
     """
     if not (np.isfinite(tolerance).all() and min(tolerance) > 0.0):
         text = f"{1e3 * tolerance[0]:g} mm, {1e3 * tolerance[1]:g} mrad"
@@ -339,7 +351,9 @@ def _followed(goal: Goal, poses: np.ndarray, start: np.ndarray) -> np.ndarray:
 
 
 def _dof(targets: Targets, chain: Chain, requested: int | None) -> tuple[int, Finding]:
-    """Return the number of pose components (6, 5 or 3) that targets determine, and the finding on it."""
+    """Return the number of pose components (6, 5 or 3) that count, and the finding on it; `requested` None: all
+    available.
+    """
     joints_only = targets.q is not None and targets.position is None
     oriented = targets.rotation is not None or joints_only
     available = 6 if oriented else 3
@@ -360,7 +374,7 @@ def _dof(targets: Targets, chain: Chain, requested: int | None) -> tuple[int, Fi
 
 
 def _reference(goal: Goal, targets: Targets, start: Sequence[float] | None, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the targets' poses (m, 4, 4) and the nominal robot's joint positions (m, n) at them."""
+    """Return the targets' poses (m, 4, 4) and the nominal robot's joint values (m, n) there [rad or m]."""
     if targets.position is None:
         assert targets.q is not None
         return see(goal.cell, targets.q).poses(), np.array(targets.q)
@@ -379,7 +393,9 @@ def _reference(goal: Goal, targets: Targets, start: Sequence[float] | None, seed
 
 
 def _sought(goal: Goal, poses: np.ndarray, start: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Return the nominal robot's joint positions (m, n): of several solutions, the one nearest to `start`."""
+    """Return the nominal robot's joint values (m, n) at the poses: of several solutions, the one nearest to `start`
+    (n,).
+    """
     best = np.tile(start, (len(poses), 1))
     cost = np.full(len(poses), np.inf)
     for first in (start, *starts):
@@ -403,7 +419,9 @@ def _sizes(difference: np.ndarray) -> np.ndarray:
 
 
 def _within(sizes: np.ndarray, tolerance: tuple[float, float]) -> np.ndarray:
-    """Return which sizes (m, 2) are within a tolerance (m,); an orientation that does not count (NaN) is."""
+    """Return which errors (m, 2) are within the tolerance, (m,) bool; an orientation that does not count (NaN) always
+    is.
+    """
     position, turn = sizes.T
     return (position <= tolerance[0]) & ~(turn > tolerance[1])
 
@@ -417,7 +435,9 @@ def _reason(
     residual: np.ndarray,
     singular: bool,
 ) -> str:
-    """Return why a target is not reached, or which of its joint values are outside the measured range; else ""."""
+    """Return why a target is not reached, or which joint values of a reached one are outside the measured range; else
+    empty.
+    """
     if reached:
         names = [name for name, out in zip(chain.joint_names, extrapolated) if out]
         if not names:
@@ -441,7 +461,9 @@ def _reason(
 def _predicted_sigmas(
     fitted: Fitted, q: np.ndarray, frame: str, tool: str, goal: Goal
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the tool's sigmas (m, 2) due to the parameters, and the tool's expected errors (m, 2), see `Commands`.
+    """Return the tool's sigmas (m, 2) due to the parameters, and its expected errors (m, 2); see `Commands`.
+
+    A tool that the fit did not place counts as known exactly.
 
     Where the fit did not place the tool, it counts as known.
     """
@@ -480,7 +502,7 @@ def _frame_note(fitted: Fitted, frame: str) -> Finding:
 
 
 def _turn_note(fitted: Fitted, dof: int) -> list[Finding]:
-    """Return a finding if targets have orientations, but no orientation was measured."""
+    """Return a finding if targets have orientations although no orientation was measured; else an empty list."""
     table = layout(fitted.cell)
     measured = np.intersect1d(fitted.free, table.index("tool"))
     axes = {table.names[k].rsplit(".", 1)[-1] for k in measured}
@@ -499,10 +521,10 @@ def _unreached(commands: Commands) -> list[str]:
 
 
 def write(commands: Commands, out: Path, partial: bool = False) -> Path:
-    """Write COMMANDS.csv, see `calib.data.poses.pose_lists`.
+    """Write the commands as CSV, see `calib.data.poses.pose_lists`, and return its path.
 
     Raises:
-        UsageError: where targets are not reached and `partial` does not allow that; nothing is written.
+        UsageError: some targets are not reached without `partial`, or none is; nothing is written.
     """
     fitted, targets = commands.fitted, commands.targets
     count = len(commands.q)
@@ -530,7 +552,7 @@ def write(commands: Commands, out: Path, partial: bool = False) -> Path:
 
 
 def lines(commands: Commands) -> list[str]:
-    """Return the lines for the user: frames, targets that are not reached, errors before and after."""
+    """Return the console lines: notes on frames, targets that are not reached, errors before and after."""
     reached, targets, fitted = commands.reached, commands.targets, commands.fitted
     result = [*commands.notes, *targets.notes]
     if targets.ignored:
@@ -577,7 +599,7 @@ def _expectation(commands: Commands) -> Finding:
 
 
 def _rms_pair(errors: np.ndarray) -> str:
-    """Return the rms of errors (m, 2) in position [m] and orientation [rad], for the user."""
+    """Return the rms of errors (m, 2) in position [m] and orientation [rad] as text."""
     position, turn = np.sqrt(np.mean(errors**2, axis=0))
     text = f"{1e3 * position:.3g} mm"
     if not np.isnan(turn):

@@ -25,14 +25,17 @@ AGREE = 5e-5
 
 @dataclass(frozen=True, eq=False)
 class Statements:
-    """What the user states of a program's frames.
+    """What the user states about a program's frames.
 
     Attributes:
         tool: ``flange`` (the all-zero tool), a tool of the fit, or ``x,y,z[,roll,pitch,yaw]`` in the controller's
-            flange [m, rad]; None: as the program says.
-        user: ``x,y,z[,roll,pitch,yaw]`` of the user frame in the controller's base; None: as the program says.
-        world, flange: poses (4, 4) of the controller's base in the arm's base, of its flange in the arm's tip.
-        files: texts of further files of the controller, by name.
+            flange [m, rad]; None: as the program states.
+        user: ``x,y,z[,roll,pitch,yaw]`` of the user frame in the controller's base [m, rad]; None: as the program
+            states.
+        world: (4, 4) pose of the controller's base in the arm's base; None: by the description or the controller's
+            rule.
+        flange: (4, 4) pose of the controller's flange in the arm's tip; None: as for `world`.
+        files: name to text of further files of the controller.
     """
 
     tool: str | None = None
@@ -47,10 +50,10 @@ class Group:
     """Poses of a program with one tool and one configuration.
 
     Attributes:
-        indices: of the targets in the program.
-        tool: as `joint_commands.placements` takes it.
-        users: (m, 4, 4) the user frames in the frame of the targets.
-        poses: (m, 4, 4) of the tool in the frame of the targets [m].
+        indices: numbers of the poses among the program's targets.
+        tool: the tool as `joint_commands.placements` takes it.
+        users: (m, 4, 4) user frames in the frame of the targets.
+        poses: (m, 4, 4) tool poses in the frame of the targets [m].
         configuration: as the program writes it; empty for none.
     """
 
@@ -63,23 +66,24 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """All poses of a program in groups, and which frames they stand in, in words."""
+    """All poses of a program in groups, and notes on their frames."""
 
     groups: tuple[Group, ...]
     notes: tuple[str, ...]
 
 
 def placed(fitted: Fitted, program: Program, frame: str, statements: Statements) -> Placed:
-    """Return where the poses of a program stand.
+    """Return a program's poses in the frame of the targets, with their tools.
 
     Args:
-        fitted: the arm.
-        program: with poses.
+        fitted: the calibrated arm.
+        program: a program with poses.
         frame: ``base``, ``nominal``, or a station of the fit, which then is the program's user frame.
-        statements: of the user.
+        statements: what the user states about the frames.
 
     Raises:
-        UsageError: with all frames that are neither read nor stated, and where both say different numbers.
+        UsageError: frames that are neither read nor stated (all are named), or a statement that contradicts the
+            program.
     """
     arm = Description.of_fit(fitted.folder, fitted.nominal.chain)
     frames = frames_in(program, statements.files)
@@ -129,10 +133,10 @@ def placed(fitted: Fitted, program: Program, frame: str, statements: Statements)
 
 
 def tool_in_tip(fitted: Fitted, controller: Controller, statements: Statements) -> str:
-    """Return the tool that is stated, as `joint_commands.placements` takes it: for joint targets, which need none.
+    """Return the stated tool as `joint_commands.placements` takes it; ``flange`` where none is stated (joint targets).
 
     Raises:
-        UsageError: for a tool that is none, and where the controller's flange is not known.
+        UsageError: a tool that cannot be read, or a controller whose flange is not known.
     """
     names = fitted.cell.tool_names
     if statements.tool is None or statements.tool in names:
@@ -170,7 +174,7 @@ def _grouped(
 
 
 def _stated_tool(statement: str | None, names: Sequence[str]) -> np.ndarray | None:
-    """Return the tool that is stated, in the controller's flange; None for none."""
+    """Return the stated tool's pose (4, 4) in the controller's flange; None where none is stated."""
     if statement == "flange":
         return np.eye(4)
     try:
@@ -185,11 +189,14 @@ def _stated_tool(statement: str | None, names: Sequence[str]) -> np.ndarray | No
 def _completed(
     program: Program, frames: ProgramFrames, kind: str, statement: np.ndarray | None, refusals: list[str]
 ) -> dict[str, np.ndarray]:
-    """Return the poses (4, 4) of a program's tools or user frames by name; `refusals` grow by what is not known.
+    """Return the poses (4, 4) of a program's tools or user frames by name; unknown frames are appended to `refusals`.
 
     Args:
+        program: the program.
+        frames: frames read from it and from further files.
         kind: ``tool`` or ``user``.
-        statement: what the user says; it counts for the frame that has no numbers.
+        statement: (4, 4) pose that the user states for the frame without numbers; None: none.
+        refusals: texts of the message on unknown frames.
     """
     if kind == "tool":
         option, label, numbers = "--tool", "tool", frames.tools
@@ -251,5 +258,7 @@ def _in_words(pose: np.ndarray) -> str:
 
 
 def user_poses(group: Group, poses: np.ndarray) -> np.ndarray:
-    """Return poses (m, 4, 4) of a group's frame in its user frames, as the program has them."""
+    """Return poses (m, 4, 4) given in the frame of the targets in the user frames of a group, as the program writes
+    them.
+    """
     return invert(group.users) @ poses

@@ -36,7 +36,7 @@ from calib.toolkit.pose_data import Targets
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Commands of some targets of a program: their indices, and the values [controller's units] they get."""
+    """Commands for some targets of a program: their indices, the new numbers [controller's units], and notes."""
 
     indices: tuple[int, ...]
     commands: Commands
@@ -49,9 +49,9 @@ class CompensatedProgram:
     """A program and new targets for it.
 
     Attributes:
-        program: as it was.
+        program: the program as read.
         parts: commands of its joint targets, and of its poses by tool and configuration.
-        notes: which frames its poses stand in.
+        notes: remarks on the frames of its poses.
     """
 
     program: Program
@@ -81,7 +81,7 @@ class CompensatedProgram:
         return lost
 
     def lines(self) -> list[str]:
-        """Return the lines for the user."""
+        """Return the console lines: notes, and targets that are not reached."""
         notes = list(self.notes)
         for part in self.parts:
             notes += part.notes
@@ -95,10 +95,10 @@ class CompensatedProgram:
         return result
 
     def write(self, out: Path, partial: bool) -> Path:
-        """Write the program with its new targets.
+        """Write the program with its new targets and return its path.
 
         Raises:
-            UsageError: where a target is not reached and `partial` does not allow that; nothing is written.
+            UsageError: some targets are not reached without `partial`, or none is; nothing is written.
         """
         lost = self.lost
         count = len(self.values)
@@ -121,20 +121,20 @@ def compensated(
     seed: int = 0,
     **options: Any,
 ) -> CompensatedProgram:
-    """Return a program's new targets.
+    """Return a program with new targets, which bring the real tool to where the program's targets are meant.
 
     Args:
         fitted: the calibrated arm.
         program: see `calib.apps.controller_programs.targets.read_program`.
-        frame: as for joint commands; a station: it is the program's user frame.
-        statements: tool and frames that the program does not say.
-        start: (n,) near which the joints of poses are sought [rad]; needed where they have no configuration.
-        seed: of further starts.
-        options: further ones of `joint_commands.computed`.
+        frame: as for joint commands; a station is the program's user frame.
+        statements: tool and frames that the program does not state; None: none.
+        start: (n,) joint values near which the joints of poses are sought [rad]; needed where poses have no
+            configuration.
+        seed: seed of further starts.
+        options: further options of `joint_commands.computed`.
 
     Raises:
-        UsageError: for a program of another number of axes, for frames that are not known, and for poses that say no
-            posture, without a start.
+        UsageError: another number of axes, unknown frames, or poses without configuration and without a start.
     """
     statements = statements or Statements()
     joints, poses = program.of("joints"), program.of("pose")
@@ -159,7 +159,7 @@ def compensated(
 
 
 def _check_postures(fitted: Fitted, program: Program, groups: Sequence[Group], start: Sequence[float] | None) -> None:
-    """Refuse poses whose program says no posture, without a start."""
+    """Raise UsageError for poses without configuration if no start is given."""
     if start is not None:
         return
     spherical = has_spherical_wrist(fitted.nominal.chain)
@@ -205,7 +205,7 @@ def _compensated_group(
 
 
 def _without(commands: Commands, reasons: Sequence[str]) -> Commands:
-    """Return commands of which those with a reason are not reached, for that reason."""
+    """Return the commands with those that have a (non-empty) reason marked as not reached."""
     reached = commands.reached.copy()
     command_reasons = list(commands.reason)
     for k, reason in enumerate(reasons):
@@ -218,7 +218,9 @@ def _without(commands: Commands, reasons: Sequence[str]) -> Commands:
 def _posture_notes(
     program: Program, group: Group, configuration: Configuration, commands: Commands, sought: Postures
 ) -> tuple[str, ...]:
-    """Return notes on poses whose configuration contradicts the start or the pose, and on commands that leave it."""
+    """Return notes on poses whose configuration contradicts the start or the pose, and on commands in another
+    configuration.
+    """
     notes = []
     reached = commands.reached
     lines = np.array([program.targets[index].line for index in group.indices])

@@ -57,13 +57,14 @@ SIGN_LABELS = (
 
 @dataclass(frozen=True)
 class Configuration:
-    """What a program says of the posture at a pose.
+    """A program's statement on the posture at a pose.
 
     Attributes:
-        text: as the program has it.
-        before, elbow, wrist: +1 or -1 of wrist centre, elbow and axis 5 (see the module); 0 where not said.
-        ranges: joint (from 0) → least and largest angle that the controller shows [rad].
-        upright: posture [rad] in which `before` and `elbow` are +1.
+        text: as the program writes it.
+        before, elbow, wrist: +1 or -1 for wrist centre, elbow and axis 5 (see the module's docstring); 0 where not
+        stated.
+        ranges: joint (from 0) to least and largest angle that the controller shows [rad].
+        upright: posture (6,) [rad] in which `before` and `elbow` are +1.
     """
 
     text: str
@@ -74,20 +75,21 @@ class Configuration:
     upright: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
     def signs(self) -> tuple[int, int, int]:
-        """Return `before`, `elbow` and `wrist`."""
+        """Return the signs `before`, `elbow` and `wrist`."""
         return self.before, self.elbow, self.wrist
 
     def agrees(self, chain: Chain, q: np.ndarray) -> np.ndarray:
-        """Return which of some postures (m, n) [rad] have the signs that are said (m,); turns are not looked at."""
+        """Return which postures q (m, n) [rad] have the stated signs, (m,) bool; turns are not checked."""
         posture_signs = signs_at(chain, q, np.array(self.upright))
         required = np.array(self.signs())
         undecided = (required == 0) | (posture_signs == 0)
         return np.all(undecided | (posture_signs == required), axis=1)
 
     def wrapped(self, controller: Controller, goal: Goal, q: np.ndarray, reference: np.ndarray) -> np.ndarray:
-        """Return postures (m, n) with whole turns added: within limits and ranges, and else nearest to `reference`.
+        """Return postures q (m, n) [rad] with whole turns added: within limits and ranges, as near to `reference` (n,)
+        as possible.
 
-        A posture that no turns bring into the ranges is NaN.
+        A joint that no turns bring into its range is NaN.
         """
         lower = np.broadcast_to(goal.lower, q.shape)
         upper = np.broadcast_to(goal.upper, q.shape)
@@ -108,7 +110,7 @@ class Configuration:
         return best
 
     def holds(self, controller: Controller, chain: Chain, q: np.ndarray) -> np.ndarray:
-        """Return which postures (m, n) [rad] have the signs and the turns that are said (m,)."""
+        """Return which postures q (m, n) [rad] have the stated signs and turns, (m,) bool."""
         allowed = self.agrees(chain, q)
         for joint, (smallest, largest) in self.ranges.items():
             angle = q[:, joint]
@@ -117,7 +119,9 @@ class Configuration:
 
 
 def has_spherical_wrist(chain: Chain) -> bool:
-    """Return whether an arm has six turning joints whose last three axes meet: the arms that configurations are of."""
+    """Return whether an arm has six revolute joints whose last three axes meet; configurations are defined for such
+    arms only.
+    """
     if chain.n != 6 or any(joint.kind != "revolute" for joint in chain.joints):
         return False
     points, axes = _axes(chain, np.zeros((1, 6)))
@@ -130,8 +134,10 @@ def has_spherical_wrist(chain: Chain) -> bool:
 
 
 def configuration_of(controller: Controller, text: str) -> Configuration | None:
-    """Return the configuration that a program says (`calib.apps.controller_programs.languages.Setting`); None for
-    none."""
+    """Return the configuration that a program states (`calib.apps.controller_programs.languages.Setting`); None if it
+    states
+    none.
+    """
     readers = {"tp": _tp, "krl": _krl, "rapid": _rapid}
     reader = readers.get(controller.language)
     if reader is None or not text:
@@ -194,12 +200,17 @@ def _rapid(fields: Sequence[str], controller: Controller) -> Configuration:
 
 
 def signs_at(chain: Chain, q: np.ndarray, upright: np.ndarray) -> np.ndarray:
-    """Return the signs (m, 3) of wrist centre, elbow and axis 5 at postures (m, 6); 0 for none.
+    """Return the signs (m, 3) of wrist centre, elbow and axis 5 at postures q (m, 6) [rad]; 0 where a sign is
+    undefined.
 
-    None is at a boundary, and where the upright posture of this arm is at one: its zeros are not the maker's.
+    A sign is undefined at a boundary, and where the upright posture of this arm is at a boundary: then the arm's zeros
+    are
+    not those of the maker.
 
     Args:
-        upright: (6,) posture whose wrist centre and elbow are +1.
+        chain: the arm.
+        q: postures.
+        upright: (6,) posture [rad] whose wrist centre and elbow have the sign +1.
     """
     distances = _distances(chain, np.vstack([upright, q]))
     upright_distances = distances[0]
@@ -212,8 +223,10 @@ def signs_at(chain: Chain, q: np.ndarray, upright: np.ndarray) -> np.ndarray:
 
 
 def _distances(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return how far (m, 2) the wrist centre is before axis 1, and beside the line from axis 2 to axis 3 (times its
-    length); with a sign of its own for each arm."""
+    """Return signed distances (m, 2): of the wrist centre before axis 1, and beside the line from axis 2 to axis 3.
+
+    The second is multiplied by the line's length. Which side is positive differs from arm to arm.
+    """
     points, axes = _axes(chain, q)
     wrist = _nearest_point(points[4], axes[4], points[3], axes[3])
     ahead = np.cross(axes[1], axes[0])
@@ -248,9 +261,9 @@ class Postures:
     """Postures of the nominal arm at m poses.
 
     Attributes:
-        q: (m, n) [rad]; where the configuration has none, the nearest of another one, or the start.
-        reasons: (m,) why there is none in the configuration, or why it is not the only one; "" where all is well.
-        contradicted: (m,) whether the posture nearest to the start has another configuration.
+        q: (m, n) [rad]; where no posture has the configuration, the nearest posture of another one, or the start.
+        reasons: (m,) why no posture has the configuration, or why it is not unique; empty where exactly one has it.
+        contradicted: (m,) True where the posture nearest to the start has another configuration.
     """
 
     q: np.ndarray
@@ -266,18 +279,18 @@ def postures(
     start: Sequence[float] | None = None,
     seed: int = 0,
 ) -> Postures:
-    """Return the posture at each of some poses (m, 4, 4) that a configuration means.
+    """Return the posture that a configuration means at each of the poses (m, 4, 4).
 
     Postures are sought from random starts in the configuration, and from `start`. Of several that agree, the nearest to
     `start` is taken; without a start they are refused as not unique.
 
     Args:
         goal: the nominal arm with the tool, and its limits.
-        poses: of the tool in the arm's base.
-        configuration: of all these poses.
-        controller: whose angles the ranges are.
-        start: (n,) [rad] near which, or None.
-        seed: of the starts.
+        poses: tool poses in the arm's base [m].
+        configuration: configuration of all these poses.
+        controller: the controller to whose angles the ranges refer.
+        start: (n,) joint values [rad] to be near; None: none.
+        seed: seed of the random starts.
     """
     chain = goal.cell.chain
     lower, upper = chain.sampling_limits()
@@ -334,7 +347,9 @@ def postures(
 def _agreeing(
     goal: Goal, configuration: Configuration, controller: Controller, reached: np.ndarray, reference: np.ndarray
 ) -> np.ndarray:
-    """Return the distinct postures of some (k, n) that have a configuration, whole turns added as it says."""
+    """Return the distinct postures out of `reached` (k, n) that have a configuration, with the whole turns that it
+    states.
+    """
     in_configuration = reached[configuration.agrees(goal.cell.chain, reached)]
     wrapped = configuration.wrapped(controller, goal, in_configuration, reference)
     wrapped = wrapped[np.isfinite(wrapped).all(axis=1)]
@@ -348,7 +363,7 @@ def _agreeing(
 def _objection(
     chain: Chain, configuration: Configuration, reached: np.ndarray, agreeing: np.ndarray, started: bool
 ) -> str:
-    """Return why the posture of a configuration is none, or not the only one; else an empty text."""
+    """Return why no posture has the configuration, or why it is not unique; else empty."""
     if not len(agreeing) and configuration.agrees(chain, reached).any():
         return f"{configuration.text} has no posture at this pose: none within the joints' limits has its turns"
     if not len(agreeing):
@@ -362,7 +377,7 @@ def _objection(
 
 
 def _sign_text(signs: np.ndarray) -> str:
-    """Return signs of wrist centre, elbow and axis 5 in words; nothing for 0."""
+    """Return signs of wrist centre, elbow and axis 5 in words; a sign of 0 is left out."""
     labels = []
     for sign, (positive, negative) in zip(signs, SIGN_LABELS):
         if sign > 0:

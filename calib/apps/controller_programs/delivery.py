@@ -1,11 +1,11 @@
-"""A calibration in a controller's words: `calib deliver FIT --for NAME`.
+"""A calibration in a controller's terms: `calib deliver FIT --for NAME`.
 
-A controller that keeps its nominal geometry takes the tool's and the instrument's frames with which the nominal arm
-meets the measurements best. One whose axes are mastered anew takes joint offsets with the frames that belong to them:
-from a fit with ``--model offsets``, since offsets of a richer model are not the best ones by themselves.
+A controller that keeps its nominal geometry takes the frames of tool and instrument with which the nominal arm fits the
+measurements best. A controller whose axes are mastered anew takes joint offsets and the frames fitted with them: from a
+fit with ``--model offsets``, since the offsets of a richer model are not the best ones by themselves.
 
-Each frame stands in the controller's base or flange (`calib.apps.controller_programs.frames`), and is printed with it.
-Where nothing says where that is, no number is printed.
+Each frame is given in the controller's base or flange (`calib.apps.controller_programs.frames`), which is printed with
+it. Where the pose of that base or flange is not known, no number is printed.
 """
 
 from collections.abc import Iterator
@@ -27,16 +27,17 @@ DECIMALS = {"m": 7, "mm": 4}
 def delivery_text(
     folder: Path, controller: Controller, world: np.ndarray | None = None, flange: np.ndarray | None = None
 ) -> str:
-    """Return what a controller can be told of a fit, as text for the person who enters it.
+    """Return the numbers of a fit that a controller takes, as text for the person who enters them.
 
     Args:
-        folder: of a fit, or of a session with one.
-        controller: whose words.
+        folder: folder of a fit, or of a session with a fit.
+        controller: the controller.
         world, flange: (4, 4) poses of the controller's base in the arm's base, and of its flange in the arm's tip,
-            where the user states them.
+        where
+            the user states them; None: by description or rule.
 
     Raises:
-        UsageError: for a folder without a fit.
+        UsageError: a folder without a fit.
     """
     result = open_result(folder, "deliver")
     result.check_arm("deliver")
@@ -75,7 +76,9 @@ def delivery_text(
 
 
 def _frames(arm: Installation, controller: Controller, base: ControllerFrame, flange: ControllerFrame) -> Iterator[str]:
-    """Yield the tools and instrument frames of an arm as the controller writes them, each with what it stands in."""
+    """Yield lines with the tools and instrument frames of an arm as the controller writes them, and their reference
+    frames.
+    """
     for index, (name, pose) in enumerate(zip(arm.tool_names, arm.tools), 1):
         yield from _stood(f"tool {name}", controller.tool_frame, controller, pose, flange, index)
     for index, (name, pose) in enumerate(zip(arm.station_names, invert(arm.stations)), 1):
@@ -85,7 +88,7 @@ def _frames(arm: Installation, controller: Controller, base: ControllerFrame, fl
 def _stood(
     name: str, form: str, controller: Controller, pose: np.ndarray, frame: ControllerFrame, index: int
 ) -> Iterator[str]:
-    """Yield the lines of one frame: its numbers in the controller's frame, and which frames they relate."""
+    """Yield the lines of one frame: its numbers in the controller's frame, and the two frames that they relate."""
     if frame.pose is None:
         yield f"  {name}: not printed, since {frame.name} is {frame.basis}"
         return
@@ -100,7 +103,9 @@ def _written(form: str, controller: Controller, pose: np.ndarray, index: int) ->
 
 
 def _mastering(robot: CalibratedChain, controller: Controller) -> Iterator[str]:
-    """Yield the offset of each axis in the controller's unit, to add to what it shows."""
+    """Yield a line with the offset of each axis, in the controller's unit, to add to the angle that the controller
+    shows.
+    """
     chain, nominal = robot.chain, nominal_of(robot)
     offsets = []
     for k in chain.moving:

@@ -36,13 +36,13 @@ NO_TURN = [0.0, 0.0, 0.0]
 
 @dataclass(frozen=True, eq=False)
 class ControllerFrame:
-    """A controller's frame in a description.
+    """A controller's frame in a robot's description.
 
     Attributes:
-        name: what the controller calls it.
+        name: the controller's name of the frame.
         pose: (4, 4) in the arm's base, or in its tip; None where it is not known.
-        basis: by what it is known, or why not and what to state.
-        warning: what speaks against it; else empty.
+        basis: how the pose is known, or why it is not and what to state.
+        warning: contradiction of the pose with the controller's rule; empty without one.
     """
 
     name: str
@@ -56,7 +56,7 @@ class ControllerFrame:
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """The nominal arm, and all links of its URDF where there is one."""
+    """The nominal arm, and all links of its URDF; `tree` is None without a URDF."""
 
     chain: Chain
     tree: UrdfTree | None = None
@@ -72,7 +72,7 @@ class Description:
 
     @property
     def prefix(self) -> str:
-        """What stands before the names of the arm's links, as ``left_``."""
+        """Prefix of the names of the arm's links, as ``left_``; empty without one."""
         names = [self.chain.base, self.chain.tip]
         if self.tree is not None:
             root, _ = _fixed_to(self.tree, self.chain.base)
@@ -84,13 +84,13 @@ class Description:
         return ""
 
     def has(self, link: str) -> bool:
-        """Return whether there is such a link."""
+        """Return whether the description has a link of this name."""
         if self.tree is None:
             return link in (self.chain.base, self.chain.tip)
         return link in self.tree.bodies
 
     def pose(self, link: str, start: str) -> np.ndarray | None:
-        """Return the pose (4, 4) of a link in another one; None where joints between them move.
+        """Return the pose T_start_link (4, 4) [m]; None where moving joints are between the two links.
 
         Args:
             link, start: names of links that exist.
@@ -106,7 +106,7 @@ class Description:
         return invert(start_pose) @ pose
 
     def moving_joint(self, link: str) -> str:
-        """Return the name of the nearest moving joint above a link."""
+        """Return the name of the nearest moving joint above a link; empty without one."""
         if self.tree is None:
             return ""
         for joint in reversed(self.tree.ancestry(link)):
@@ -116,7 +116,7 @@ class Description:
 
 
 def _fixed_to(tree: UrdfTree, link: str) -> tuple[str, np.ndarray]:
-    """Return the topmost link that a link is fixed to, and its pose (4, 4) in that."""
+    """Return the topmost link that a link is rigidly fixed to, and the link's pose (4, 4) in it."""
     pose = np.eye(4)
     while link in tree.above and tree.above[link].kind == "fixed":
         pose = tree.above[link].origin @ pose
@@ -125,10 +125,10 @@ def _fixed_to(tree: UrdfTree, link: str) -> tuple[str, np.ndarray]:
 
 
 def stated_frame(statement: str | None, option: str) -> np.ndarray | None:
-    """Return the pose (4, 4) that an option states as ``x,y,z[,roll,pitch,yaw]`` [m, rad]; None for no words.
+    """Return the pose (4, 4) that an option states as ``x,y,z[,roll,pitch,yaw]`` [m, rad]; None where it is not given.
 
     Raises:
-        UsageError: for other than three or six finite numbers, and for positions that can only be millimetres.
+        UsageError: not three or six finite numbers, or a position so large that it must be in millimetres.
     """
     if statement is None:
         return None
@@ -146,12 +146,12 @@ def stated_frame(statement: str | None, option: str) -> np.ndarray | None:
 
 
 def base_frame(controller: Controller, arm: Description, statement: np.ndarray | None = None) -> ControllerFrame:
-    """Return the controller's base frame, its pose in the arm's base.
+    """Return the controller's base frame, with its pose in the arm's base.
 
     Args:
-        controller: whose frame.
+        controller: the controller.
         arm: the nominal arm with its links.
-        statement: by the user; it counts before all else.
+        statement: (4, 4) pose that the user states, which overrides all else; None: not stated.
     """
     name, chain = controller.base, arm.chain
     if statement is not None:
@@ -188,7 +188,9 @@ def base_frame(controller: Controller, arm: Description, statement: np.ndarray |
 
 
 def flange_frame(controller: Controller, arm: Description, statement: np.ndarray | None = None) -> ControllerFrame:
-    """Return the controller's flange (its all-zero tool), its pose in the arm's tip; arguments as in `base_frame`."""
+    """Return the controller's flange (its all-zero tool), with its pose in the arm's tip; arguments as for
+    `base_frame`.
+    """
     name, chain = controller.flange, arm.chain
     if statement is not None:
         return ControllerFrame(name, statement, f"stated: {_relation(statement, chain.tip)}")
@@ -213,7 +215,11 @@ def flange_frame(controller: Controller, arm: Description, statement: np.ndarray
 
 
 def _by_rule(controller: Controller, arm: Description) -> tuple[np.ndarray | None, str]:
-    """Return where the controller's base stands by its rule, in the arm's base, and the rule in words."""
+    """Return the pose (4, 4) of the controller's base in the arm's base by the controller's rule, and the rule in
+    words.
+
+    The pose is None where no rule applies; the text then says why.
+    """
     foot = arm.prefix + "base_link"
     if not controller.base_at:
         return None, f"nothing is known of {controller.title}"
@@ -238,7 +244,9 @@ def _by_rule(controller: Controller, arm: Description) -> tuple[np.ndarray | Non
 
 
 def _height_of_axis_2(chain: Chain, foot: np.ndarray) -> float | None:
-    """Return the height of axis 2 over a frame [m]; None where axis 1 is not its z, or axis 2 not level."""
+    """Return the height of axis 2 above the frame `foot` [m]; None where axis 1 is not its z axis, or axis 2 is not
+    level.
+    """
     if chain.n < 2:
         return None
     # both axes in the frame
@@ -258,7 +266,7 @@ def _height_of_axis_2(chain: Chain, foot: np.ndarray) -> float | None:
 
 
 def _line(chain: Chain, joint: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a point of a joint's axis and its direction at q = 0, in the arm's base."""
+    """Return a point (3,) [m] on a joint's axis and the axis' direction (3,) at q = 0, in the arm's base."""
     frame = joint_frames(chain, np.zeros((1, chain.n)))[joint, 0]
     element = chain.elements[int(chain.moving[joint])]
     column = AXES.index(element.axis) % 3
@@ -266,7 +274,7 @@ def _line(chain: Chain, joint: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _off_axis(chain: Chain, pose: np.ndarray) -> float:
-    """Return the angle [rad] between z of a frame in the tip and the arm's last axis."""
+    """Return the angle [rad] between the arm's last axis and the z axis of a frame whose pose in the tip is `pose`."""
     (tip,) = forward(chain, np.zeros((1, chain.n)))
     z = (tip @ pose)[:3, 2]
     _, last_axis = _line(chain, chain.n - 1)
@@ -281,7 +289,7 @@ def _differs(first: np.ndarray, second: np.ndarray) -> bool:
 
 
 def _relation(pose: np.ndarray, link: str) -> str:
-    """Return in words where a frame stands against a link."""
+    """Return in words the pose of a frame relative to a link."""
     xyz, rpy = to_xyz_rpy(pose)
     turned, shifted = np.abs(rpy) > 1e-9, np.abs(xyz) > 1e-9
     if not turned.any() and not shifted.any():
@@ -306,10 +314,10 @@ def _relation(pose: np.ndarray, link: str) -> str:
 
 
 def check_known(frames: list[ControllerFrame], heading: str) -> None:
-    """Refuse to go on where a frame is not known, with all that is to be stated.
+    """Raise UsageError if a frame is not known.
 
     Raises:
-        UsageError: with `heading`, and for each frame what to state.
+        UsageError: with `heading`, and for each unknown frame what to state.
     """
     missing = [f"  {frame.name} is {frame.basis}" for frame in frames if frame.pose is None]
     if missing:

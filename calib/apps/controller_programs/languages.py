@@ -31,11 +31,11 @@ BEHIND = 120
 
 @dataclass(frozen=True)
 class Setting:
-    """What a program says of one of its poses.
+    """A program's statements on one of its poses.
 
     Attributes:
-        tool, user: names of the tool and of the user frame as `ProgramFrames` has them; empty where it says none.
-        configuration: as the program writes it; empty where it says none.
+        tool, user: names of tool and user frame as in `ProgramFrames`; empty where not stated.
+        configuration: as the program writes it; empty where not stated.
     """
 
     tool: str
@@ -45,7 +45,12 @@ class Setting:
 
 @dataclass(frozen=True, eq=False)
 class ProgramFrames:
-    """Settings of a program's poses in their order, and the frames with numbers, by name: poses (4, 4) [m]."""
+    """Settings of a program's poses, in the program's order, and the frames with known numbers.
+
+    Attributes:
+        settings: one per pose.
+        tools, users: name to pose (4, 4) [m] of tools in the controller's flange, and of user frames in its base.
+    """
 
     settings: tuple[Setting, ...]
     tools: Mapping[str, np.ndarray] = field(default_factory=dict)
@@ -53,15 +58,17 @@ class ProgramFrames:
 
 
 def frames_in(program: Program, further: Mapping[str, str] | None = None) -> ProgramFrames:
-    """Return what a program, and further files of its controller, say of the frames of its poses.
+    """Return the settings and frames of a program's poses, read from the program and from further files of its
+    controller.
 
     Args:
         program: the program.
-        further: texts by file name.
+        further: file name to text; None: no further files.
 
     Raises:
-        UsageError: for a language whose frames are not read, tools that stand in the cell, and a frame that the texts
-            give twice with other numbers.
+        UsageError: a language whose frames are not read, a tool fixed in the cell, or a frame given twice with
+            different
+            numbers.
     """
     language = LANGUAGES.get(program.controller.language)
     if language is None:
@@ -88,14 +95,14 @@ Frames = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Language:
-    """How a language says frames.
+    """How a language writes frames.
 
     Attributes:
-        comment: what begins a comment, or an empty text.
-        setting: text without comments, target → what is said of it.
-        numbers: text without comments, controller → tools and user frames with numbers.
+        comment: what begins a comment; empty without comments.
+        setting: (text without comments, target) to the target's setting.
+        numbers: (text without comments, controller) to tools and user frames with numbers.
         flange, world: names of the all-zero tool and of the controller's base.
-        files: which files hold the numbers, in words; empty for none.
+        files: the files that hold the numbers, in words; empty for none.
     """
 
     comment: str
@@ -106,7 +113,7 @@ class Language:
     files: str
 
     def base(self) -> Frames:
-        """Return the user frames that are the controller's base."""
+        """Return the user frames that coincide with the controller's base: name to identity."""
         return dict.fromkeys(self.world, np.eye(4))
 
     def without_comments(self, text: str) -> str:
@@ -117,18 +124,20 @@ class Language:
 
 
 def _frame(form: str) -> str:
-    """Return a regular expression of a frame: NUM stands for a number, a blank for any blanks."""
+    """Return the regular expression of a frame from a short form: NUM is a number, a blank any number of blanks."""
     return form.replace(" ", r"\s*").replace("NUM", NUMBER)
 
 
 def _posed(match: re.Match[str], first: int, controller: Controller, count: int = 6) -> np.ndarray:
-    """Return the pose (4, 4) of the numbers of a match from a group on."""
+    """Return the pose (4, 4) [m] from `count` numbers of a match, beginning at group `first`."""
     values = [float(match[group]) for group in range(first, first + count)]
     return pose_of_values(controller, np.array([values]))[0]
 
 
 def _either(pairs: set[tuple[str, str]]) -> tuple[str, str]:
-    """Return the names of tool and user frame of several moves; where they differ, a name that no frame has."""
+    """Return the names of tool and user frame of several moves; where moves differ, names joined by 'or', which no
+    frame has.
+    """
     tools = {tool for tool, _ in pairs}
     users = {user for _, user in pairs}
     return " or ".join(sorted(tools)), " or ".join(sorted(users))
@@ -155,7 +164,9 @@ def _tp_setting(text: str, target: Target) -> Setting:
 
 
 def _tp_name(text: str, kind: str, number: str) -> str:
-    """Return the name of a frame; for ``F`` (whichever is active) that of the only one that the program selects."""
+    """Return a frame's name; for number ``F`` (the active frame) that of the only frame the program selects, else
+    empty.
+    """
     if not number.isdigit():
         selected = set(re.findall(rf"{kind}_NUM\s*=\s*(\d+)", text))
         if len(selected) != 1:

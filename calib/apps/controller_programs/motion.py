@@ -19,10 +19,10 @@ PREFIX = "q_"
 
 
 def motion_file(path: Path) -> Path:
-    """Return the file to play of a motion's folder; of a file, that file.
+    """Return the file to play: for a motion's folder the motion in it, for a file that file.
 
     Raises:
-        UsageError: for a folder without a motion.
+        UsageError: a folder without a motion.
     """
     if path.is_file() and path.suffix != ".npz":
         return path
@@ -30,7 +30,7 @@ def motion_file(path: Path) -> Path:
 
 
 def is_motion(path: Path) -> bool:
-    """Return whether a CSV file holds a motion: it has a column t."""
+    """Return whether a CSV file holds a motion: whether it has a column t."""
     return "t" in read_header(path)[0]
 
 
@@ -38,7 +38,7 @@ def setpoints(path: Path, controller: Controller) -> tuple[np.ndarray, list[str]
     """Return the setpoints (k, n) [rad] of a motion at a controller's cycle, and the joints' names.
 
     Raises:
-        UsageError: for a controller that takes no stream, and a file without positions.
+        UsageError: a controller that takes no stream, or a file without positions.
     """
     from scipy.interpolate import CubicSpline  # slow to load
 
@@ -61,7 +61,7 @@ def setpoints(path: Path, controller: Controller) -> tuple[np.ndarray, list[str]
 
 
 def stream_values(controller: Controller, q: np.ndarray) -> dict[str, object]:
-    """Return what the templates of streams print of setpoints (k, n) [rad]."""
+    """Return the values that the templates of streams print for setpoints q (k, n) [rad]."""
     controller_values = controller.shown(q)
     rows = formatted(controller_values, controller.decimals)
     relative = formatted(controller_values - controller_values[0], controller.decimals)

@@ -35,10 +35,11 @@ def joints_in(path: Path, source: str = "") -> tuple[np.ndarray, list[str]]:
     In a CSV, the joints are the columns whose header states an angle (``joint1 [deg]``).
 
     Args:
-        source: the controller of a program, where its suffix does not say it.
+        path: the file.
+        source: the controller of a program, where its suffix does not determine it; empty otherwise.
 
     Raises:
-        UsageError: for sliding joints, and where no column is a joint.
+        UsageError: prismatic joints, a program of poses, or no column of joint angles.
     """
     if source or is_program(path):
         program = read_program(path, source)
@@ -67,7 +68,7 @@ def joints_in(path: Path, source: str = "") -> tuple[np.ndarray, list[str]]:
 def joints_table(path: Path, source: str = "") -> Table:
     """Return the joints of `joints_in` as a table [deg], with a column ``pose`` where the program numbers all of them.
 
-    So do the joints that a controller kept: a UR's log, a KUKA's ``.dat``, a FANUC's ``POSREG.VA``.
+    The file may also be one in which a controller kept joints: a UR's log, a KUKA's ``.dat``, a FANUC's ``POSREG.VA``.
     """
     q, names = joints_in(path, source)
     header = list(names)
@@ -87,19 +88,19 @@ def joints_table(path: Path, source: str = "") -> Table:
 def program_files(
     path: Path, out: Path, name: str, settings: ProgramSettings | None = None, source: str = ""
 ) -> dict[Path, str]:
-    """Return the files of a program of the poses in a CSV file or in another program: path → text.
+    """Return the files of a program made from the poses in a CSV file or in another program: path to text.
 
     Args:
         path: CSV of poses (``joint1 [deg]``) or of a motion (``t [s]``), or a program whose targets are joints.
-        out: its name, without the suffix, is the program's. A program of one file is written there as named; without a
-            suffix, and for programs of several files, the suffixes are the controller's.
-        name: of a controller, or ``csv``: the poses as a table.
-        settings: how it moves and waits.
+        out: the output path; its name without suffix is the program's name. A program of one file is written to exactly
+            this path; without a suffix, and for programs of several files, the suffixes are the controller's.
+        name: name of a controller, or ``csv``: the poses as a table.
+        settings: how the program moves and waits; None: the defaults.
         source: see `joints_in`.
 
     Raises:
-        UsageError: for an unknown controller, a name that it does not take, another number of axes, and an output where
-            it has none.
+        UsageError: an unknown controller, a program name that it does not take, another number of axes, or an output
+            where it has none.
     """
     settings = settings or ProgramSettings()
     if name == CSV:
@@ -150,7 +151,7 @@ def _csv_text(table: Table) -> str:
 
 
 def _targets(out: Path, names: list[str], controller: Controller) -> list[Path]:
-    """Return where the files of a program are written; `names` are the controller's for them."""
+    """Return the paths of a program's files; `names` are the controller's names for them."""
     usual = [out.with_name(name) for name in names]
     if not out.suffix:
         return usual
@@ -164,13 +165,13 @@ def _targets(out: Path, names: list[str], controller: Controller) -> list[Path]:
 
 
 def write_program(path: Path, out: Path, name: str) -> list[Path]:
-    """Write the program of a session's planned poses; return its files."""
+    """Write the program of a session's planned poses; return the paths of its files."""
     texts = program_files(path, out, name)
     return [files.write(target, text) for target, text in texts.items()]
 
 
 def _poses(controller: Controller, q: np.ndarray, settings: ProgramSettings) -> list[list[str]]:
-    """Return poses (m, n) [rad] as a controller's programs have them."""
+    """Return poses q (m, n) [rad] as texts in the units and decimals of a controller's programs."""
     values = controller.shown(q)
     if controller.pulses:
         values = values * np.array(settings.pulses)
@@ -178,7 +179,7 @@ def _poses(controller: Controller, q: np.ndarray, settings: ProgramSettings) -> 
 
 
 def _head(controller: Controller, names: list[str], moving: bool) -> list[str]:
-    """Return what stands at a program's head: what is not checked, and whose joints these are."""
+    """Return the comment lines at a program's head: what was not checked, and the names of the joints."""
     joints = f"Joints: {', '.join(names)}"
     for axis, partner, sign in controller.coupled:
         operator = {1: "+", -1: "-"}[sign]

@@ -29,11 +29,11 @@ class Target:
     """One target in a program.
 
     Attributes:
-        line: in the file, from 1.
+        line: its line in the file, from 1.
         spans: begin and end of each of its numbers in the text.
-        values: these numbers, in the controller's units.
+        values: the numbers, in the controller's units.
         kind: ``joints`` or ``pose``.
-        number: of the pose, where the text before it says one; else 0.
+        number: number of the pose, where the text before the target states one; else 0.
     """
 
     line: int
@@ -45,10 +45,13 @@ class Target:
 
 @dataclass(frozen=True)
 class Program:
-    """The text of a program with its targets, in their order.
+    """The text of a program with its targets.
 
     Attributes:
-        path, controller, text: where it is, whose it is, and its bytes as Latin-1.
+        path: its file.
+        controller: its controller.
+        text: the file's bytes as Latin-1.
+        targets: its targets, in the order of the text.
     """
 
     path: Path
@@ -57,17 +60,19 @@ class Program:
     targets: tuple[Target, ...]
 
     def of(self, kind: str) -> list[int]:
-        """Return the indices of the targets of a kind."""
+        """Return the indices of the targets of a kind (``joints`` or ``pose``)."""
         return [k for k, target in enumerate(self.targets) if target.kind == kind]
 
     @property
     def moves(self) -> int:
-        """Number of motion statements, comments aside."""
+        """Number of motion statements outside comments."""
         return len(_matches(self.text, self.controller.moves, self.controller.comment))
 
     @property
     def unread(self) -> str:
-        """Warning where motion statements have no target here, with the first of their lines; else empty."""
+        """Warning on motion statements without a target in their line, with the first of these lines; empty if all have
+        one.
+        """
         target_lines = {target.line for target in self.targets}
         move_lines = _lines_of_moves(self.text, self.controller)
         lines = [line for line in move_lines if line not in target_lines]
@@ -78,7 +83,7 @@ class Program:
         return f"warning: {self.moves} moves, {len(self.targets)} targets: {reason} ({location})"
 
     def joints(self) -> np.ndarray:
-        """Return the joint targets (m, n) as joints of a description [rad]."""
+        """Return the joint targets (m, n) as joint values of a robot's description [rad]."""
         values = self._values("joints")
         return self.controller.described(values * ANGLES[self.controller.unit])
 
@@ -91,7 +96,9 @@ class Program:
         return np.array([target.values for target in self.targets if target.kind == kind])
 
     def rewritten(self, values: Sequence[np.ndarray | None]) -> bytes:
-        """Return the program with other numbers in its targets, in the controller's units; None leaves a target."""
+        """Return the program's bytes with new numbers in its targets, in the controller's units; None leaves a target
+        unchanged.
+        """
         text = self.text
         parts = []
         position = 0
@@ -111,7 +118,7 @@ class Program:
 
 
 def number(value: float, decimals: int) -> str:
-    """Return a number with fixed decimals; no negative zero."""
+    """Return a number as text with fixed decimals, without a negative zero."""
     written = f"{value:.{decimals}f}"
     if float(written) == 0.0:
         return written.removeprefix("-")
@@ -124,7 +131,7 @@ def formatted(values: np.ndarray, decimals: int) -> list[list[str]]:
 
 
 def pose_values(controller: Controller, poses: np.ndarray) -> np.ndarray:
-    """Return the numbers (m, 6 or 7) of poses (m, 4, 4) [m] as they stand in a controller's programs."""
+    """Return the numbers (m, 6 or 7) of poses (m, 4, 4) [m] as a controller's programs write them."""
     rotation = Rotation.from_matrix(poses[:, :3, :3])
     if controller.turn == "wxyz":
         angles = rotation.as_quat(canonical=True)[:, [3, 0, 1, 2]]
@@ -138,7 +145,7 @@ def pose_values(controller: Controller, poses: np.ndarray) -> np.ndarray:
 
 
 def pose_of_values(controller: Controller, values: np.ndarray) -> np.ndarray:
-    """Return the poses (m, 4, 4) [m] of their numbers (m, 6 or 7) in a controller's programs."""
+    """Return the poses (m, 4, 4) [m] from the numbers (m, 6 or 7) that a controller's programs write."""
     rotation = _rotation(controller.turn, values[:, 3:])
     position = values[:, :3] * controller.metres
     return pose_of(rotation, position)
@@ -170,10 +177,10 @@ def is_program(path: Path) -> bool:
 
 
 def text_of(path: Path) -> str:
-    """Return the text of a controller's file, one letter for each byte.
+    """Return the text of a controller's file, one character for each byte.
 
     Raises:
-        MeasurementError: where it cannot be read.
+        MeasurementError: the file cannot be read.
     """
     try:
         return path.read_bytes().decode(ENCODING)
@@ -185,11 +192,11 @@ def read_program(path: Path, controller: str = "") -> Program:
     """Return a program with its targets.
 
     Args:
-        path: of the program's file.
-        controller: its name in ``controllers.toml``; by default the suffix says it.
+        path: the program's file.
+        controller: its name in ``controllers.toml``; empty: determined by the suffix.
 
     Raises:
-        MeasurementError: where the file cannot be read, or has no targets.
+        MeasurementError: the file cannot be read, or has no targets.
     """
     kind = controller_of(path, controller)
     text = text_of(path)
@@ -204,7 +211,7 @@ def read_program(path: Path, controller: str = "") -> Program:
 
 
 def _matches(text: str, pattern: str, comment: str) -> list[re.Match[str]]:
-    """Return what matches a pattern outside comments."""
+    """Return the matches of a pattern outside comments; none for an empty pattern."""
     if not pattern:
         return []
     matches = re.finditer(pattern.replace("NUM", NUMBER), text)
@@ -225,7 +232,7 @@ def _lines_of_moves(text: str, controller: Controller) -> list[int]:
 
 
 def _line_at(text: str, position: int) -> int:
-    """Return the line of a position in a text, from 1."""
+    """Return the line number, from 1, of a position in a text."""
     return text.count("\n", 0, position) + 1
 
 
@@ -242,7 +249,7 @@ def _targets_of_kind(text: str, kind: str, controller: Controller) -> list[Targe
 
 
 def _pose_number(text: str, match: re.Match[str], controller: Controller) -> int:
-    """Return the number of a pose that the text before its target says; 0 where it says none."""
+    """Return the pose number that the text before a target states; 0 where it states none."""
     if not controller.numbered:
         return 0
     before = text[max(match.start() - NEAR, 0) : match.start(1)]

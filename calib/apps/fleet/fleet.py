@@ -35,15 +35,15 @@ class FleetRow:
     """The outcome of one session: state, verdict, errors and exit code.
 
     Attributes:
-        folder: of the session.
+        folder: the session's folder or address.
         state: `DONE`, `WAITS`, `BUSY` (another command works on it) or `FAILED`.
-        verdict: of a session that is done.
-        words: what it waits for, or what went wrong.
-        asks: what to do at the robot now, in lines.
-        nominal, calibrated: position error on unseen poses, rms [mm]; None where there is none.
-        torque: unexplained on unseen motion [%]; None without dynamics.
-        seconds: of wall time.
-        code: exit code, as `calib next` would have.
+        verdict: verdict of a finished session; else empty.
+        words: the file that it waits for, or the error.
+        asks: instructions to the engineer at the robot, one per line.
+        nominal, calibrated: position error at held-out poses, rms [mm]; None without such poses.
+        torque: unexplained share of the torque on the held-out motion [%]; None without dynamics.
+        seconds: wall-clock time [s].
+        code: exit code, as of `calib next`.
     """
 
     folder: str
@@ -61,7 +61,7 @@ class FleetRow:
         return "\n".join([self.line(), *(self.asks or remarks([self]))])
 
     def line(self) -> str:
-        """Return the outcome of the session as a line."""
+        """Return the outcome of the session as one line."""
         parts = [self.state]
         if self.verdict:
             parts.append(self.verdict)
@@ -81,21 +81,21 @@ def run_sessions(
     plots: bool = True,
     command: str = "calib.run_sessions",
 ) -> Iterator[FleetRow]:
-    """Run sessions as far as possible, and yield the outcome of each; failures do not stop the others.
+    """Run sessions as far as possible, and yield the outcome of each; a failed session does not stop the others.
 
     Args:
-        folders: of the sessions, or their ``session.toml``; one or several. Or addresses of fsspec, with or without
-            wildcards (``s3://bucket/cells/*``): each worker fetches its session, and puts it back.
-        workers: local processes, or the address of a Dask scheduler.
+        folders: one or several folders of sessions, or their ``session.toml``. Or addresses of fsspec, with or without
+            wildcards (``s3://bucket/cells/*``): each worker fetches its session, and writes it back.
+        workers: number of local processes, or the address of a Dask scheduler.
         plots: whether figures are drawn.
-        command: for the sessions' records.
+        command: command line that the sessions record.
 
     Returns:
-        Rows as sessions end: ``folder``, ``state`` (done, waits, busy or failed), ``verdict``; ``print`` says what to
-        do now.
+        Rows in the order in which sessions end: ``folder``, ``state`` (done, waits, busy or failed), ``verdict``;
+        ``print`` shows the instructions to the engineer.
 
     Raises:
-        UsageError: for a session that is named twice, or where none is.
+        UsageError: a session named twice, or a folder without one.
     """
     return run(folders_of(folders, stores.sessions), opened(workers), command, plots)
 
@@ -107,7 +107,7 @@ def run(
     plots: bool = True,
     pace: Throughput | None = None,
 ) -> Iterator[FleetRow]:
-    """Run every session and yield each outcome; workers on other machines need the same folder paths, or addresses."""
+    """Run every session and yield each outcome; workers on other machines need identical folder paths, or addresses."""
     pace = pace or Throughput()
     run_folder = partial(run_session, command=command, plots=plots)
     with workers as crew:
@@ -124,13 +124,14 @@ def run(
 
 
 def run_session(folder: Path | str, command: str = "calib run", plots: bool = True, lease: float = LEASE) -> FleetRow:
-    """Run one session as far as possible, and write its output to ``run.log``. It raises nothing but Ctrl-C.
+    """Run one session as far as possible, write its output to ``run.log`` and return the outcome. Only Ctrl-C is
+    raised.
 
     Args:
-        folder: of the session, or its address.
-        command: for the record.
+        folder: the session's folder, or its address.
+        command: command line that the session records.
         plots: whether figures are drawn.
-        lease: see `calib.apps.fleet.stores`.
+        lease: see `calib.apps.fleet.stores` [s].
     """
     if isinstance(folder, Path):
         return _run_here(folder, command, plots)
@@ -202,7 +203,9 @@ def _no_progress(message: str) -> None:
 
 
 def table(outcomes: Sequence[FleetRow]) -> RenderableType:
-    """Return the summary table, a line per robot: rms errors on unseen poses, and on unseen motion."""
+    """Return the summary table, one line per robot: rms errors at held-out poses and unexplained torque on held-out
+    motions.
+    """
     summary_table = Table("session", "state", "verdict", box=None, pad_edge=False)
     for name in ("nominal mm", "calibrated mm", "torque %", "s"):
         summary_table.add_column(name, justify="right", no_wrap=True)
@@ -228,7 +231,7 @@ def table(outcomes: Sequence[FleetRow]) -> RenderableType:
 
 
 def remarks(outcomes: Sequence[FleetRow]) -> Iterator[str]:
-    """Yield a line for each incomplete session: the missing file, or the error."""
+    """Yield a line for each session that is not finished: the missing file, or the error."""
     beginnings = {WAITS: "{} waits for ", FAILED: "{} failed: "}
     for row in outcomes:
         if row.state == DONE:

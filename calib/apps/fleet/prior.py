@@ -1,6 +1,6 @@
 """Distribution of geometric parameters over arms of one type, and from it a prior for the next arm's fit.
 
-With x_i the deviations of arm i's parameters from nominal, of which its fit tells x̂_i with covariance C_i,
+With x_i the deviations of arm i's parameters from nominal, which its fit estimates as x̂_i with covariance C_i,
 
     x̂_i ~ N(x_i, C_i),  x_i ~ N(μ, diag τ²)
 
@@ -38,13 +38,13 @@ OPTIONS = "options.toml"
 
 @dataclass(frozen=True)
 class ParameterSpread:
-    """One parameter over the arms of a type.
+    """Distribution of one parameter over the arms of a type.
 
     Attributes:
-        name, unit: of the parameter.
-        arms: that it was fitted in.
-        mean, sigma: of its deviation from nominal over arms, without the fits' own uncertainty.
-        width: standard deviation about ``nominal + mean`` that the next arm is expected within.
+        name, unit: name and unit of the parameter.
+        arms: number of arms in which it was fitted.
+        mean, sigma: mean and σ over arms of its deviation from nominal, without the uncertainty of the fits.
+        width: standard deviation about ``nominal + mean`` that is expected for the next arm.
     """
 
     name: str
@@ -56,10 +56,11 @@ class ParameterSpread:
 
 
 def spread(robots: Sequence[CalibratedChain]) -> tuple[ParameterSpread, ...]:
-    """Return the distribution of each parameter that was fitted in one arm at least; arms of one nominal.
+    """Return the distribution of each parameter that was fitted in at least one arm; the arms have one nominal
+    description.
 
     Raises:
-        UsageError: where no fit states its covariance.
+        UsageError: no fit states its covariance.
     """
     chain = nominal_of(robots[0])
     covariances = []
@@ -101,7 +102,7 @@ def spread(robots: Sequence[CalibratedChain]) -> tuple[ParameterSpread, ...]:
 def _most_probable(
     data: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], family: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return μ (k,) and τ (k,) of each arm's (fitted parameters, C⁻¹, C⁻¹ x̂) by expectation maximisation."""
+    """Return μ (k,) and τ (k,) by expectation maximisation from each arm's (fitted parameters, C⁻¹, C⁻¹ x̂)."""
     mean = np.zeros(len(family))
     variance = np.full(len(family), FIRST_VARIANCE)
     count = np.sum([fitted for fitted, _, _ in data], axis=0)
@@ -129,7 +130,7 @@ def _most_probable(
 
 
 def expected_arm(robots: Sequence[CalibratedChain], parameters: Sequence[ParameterSpread]) -> CalibratedChain:
-    """Return the arm that the next one of this type is expected to be, of the nominal one that `robots` share."""
+    """Return the arm expected next: the nominal description that `robots` share, moved by the mean deviations."""
     nominal = nominal_of(robots[0])
     means = {parameter.name: parameter.mean for parameter in parameters}
     values = nominal.values + np.array([means.get(name, 0.0) for name in nominal.names])
@@ -137,7 +138,9 @@ def expected_arm(robots: Sequence[CalibratedChain], parameters: Sequence[Paramet
 
 
 def write(folder: Path, robots: Sequence[CalibratedChain], parameters: Sequence[ParameterSpread]) -> Path:
-    """Write the prior for `calib fit`: ``robot.toml``, the expected arm, and the options with its widths."""
+    """Write the prior for `calib fit` into a folder: ``robot.toml``, the expected arm, and options with the prior's
+    widths.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     write_calibrated(folder, expected_arm(robots, parameters), comment=f"mean of {len(robots)} arms")
     lines = [f'"{parameter.name}" = {parameter.width:.4g}' for parameter in parameters]

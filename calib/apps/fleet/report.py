@@ -1,4 +1,6 @@
-"""Report of a fleet: which arms drift, which share a bad tool, how parameters are distributed over arms of one type."""
+"""Report of a fleet: arms that drift, tools that are bent or loose, the distribution of parameters over arms of one
+type.
+"""
 
 from __future__ import annotations
 
@@ -40,12 +42,12 @@ class ArmType:
     """Arms of one nominal description, each by its latest calibration.
 
     Attributes:
-        name: of the description, with a number where several descriptions have one name.
+        name: name of the description, with a number where several descriptions have one name.
         arms: their calibrations.
-        failed: names of those whose fit's verdict is fail: no part of `parameters`.
-        odd: names of others whose geometry is not plausible for this type: no part of `parameters`, either.
-        parameters: their distribution.
-        tools: of all arms.
+        failed: names of arms whose fit's verdict is fail; they do not enter `parameters`.
+        odd: names of other arms whose geometry is not plausible for this type; they do not enter `parameters` either.
+        parameters: distribution of each parameter over the other arms.
+        tools: the tools of all arms.
     """
 
     name: str
@@ -57,13 +59,13 @@ class ArmType:
 
     @property
     def plausible(self) -> list[Calibration]:
-        """The arms that `parameters` are of."""
+        """The arms from which `parameters` were computed."""
         return [arm for arm in self.arms if arm.name not in (*self.failed, *self.odd)]
 
 
 @dataclass(frozen=True, eq=False)
 class FleetReport(Judged):
-    """What the calibrations of many arms say together. ``print`` shows the verdict, drifts, tools and parameters.
+    """Comparison of the calibrations of many arms. ``print`` shows the verdict, drifts, tools and parameters.
 
     Attributes:
         types: the arms by their nominal description.
@@ -101,9 +103,10 @@ class FleetReport(Judged):
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write a folder: report.html, fleet.csv (a row per arm), metrics.json; and for each type a prior.
+        """Write a folder with report.html, fleet.csv (a row per arm), metrics.json; and for each type a prior. Return
+        the folder.
 
-        That is for the fit of the type's next arm.
+        The prior is for the fit of the type's next arm.
         """
         out = Path(out)
         folders.check_target(out, OURS, (folders.METRICS,), "fleet report")
@@ -210,7 +213,7 @@ def _displacement_mm(row: ToolUse) -> str:
 
 
 def _error_sigmas(row: ToolUse) -> str:
-    """Return how sure a larger error is; empty for a tool whose error is about that of the others."""
+    """Return as text how many σ a tool's error is above that of other tools; empty where it is not larger."""
     assert row.times is not None
     if row.times > MIN_TIMES:
         return f"{row.times_sigmas:.1f}"
@@ -230,14 +233,14 @@ def report_fleet(calibrations: str | Path | Sequence[str | Path]) -> FleetReport
     """Compare the calibrations of many arms.
 
     Args:
-        calibrations: folders of fits or sessions. Sessions that state one serial number are of one arm, in order of
-            their dates; a fit states none and counts as an arm of its own. Sessions without a verdict are left out.
+        calibrations: folders of fits or sessions. Sessions that state one serial number belong to one arm, in order of
+            their dates; a fit states none and counts as a separate arm. Sessions without a verdict are left out.
 
     Returns:
-        ``types`` with the distribution of each parameter, ``changes``, ``noticed``, `save`.
+        The report: ``types`` with the distribution of each parameter, ``changes``, ``noticed``, `save`.
 
     Raises:
-        UsageError: for a folder that holds no fit, or one given twice; where unfinished sessions leave one or none.
+        UsageError: a folder that holds no fit or is given twice, or fewer than two calibrations that are finished.
     """
     fleet_visits = visits(calibrations)
     changes: list[tuple[str, RobotChange]] = []
@@ -272,7 +275,9 @@ def report_fleet(calibrations: str | Path | Sequence[str | Path]) -> FleetReport
 
 
 def _arms_of_type(types: list[list[Calibration]], calibration: Calibration) -> list[Calibration]:
-    """Return the arms of the same nominal description; a new list at the end of `types` where there are none yet."""
+    """Return the list in `types` of the arms with this nominal description; a new list, appended, where there is none
+    yet.
+    """
     for arms in types:
         with suppress(RobotError):
             check_same_robot((arms[0].name, calibration.name), (arms[0].robot, calibration.robot))
@@ -286,7 +291,7 @@ def _failed(calibration: Calibration) -> bool:
 
 
 def _failure(calibration: Calibration, share: float) -> Finding:
-    """Return that a fit failed, and why; `share`: of the arms of its type whose fits did."""
+    """Return the finding that an arm's fit failed; `share` is the share of arms of its type whose fits failed."""
     return finding("arm-failed", arm=calibration.name, reason=calibration.judged[1], share=share)
 
 
@@ -310,7 +315,7 @@ def _arm_type(name: str, arms: Sequence[Calibration]) -> ArmType:
 
 
 def _farthest(calibration: Calibration) -> tuple[str, float]:
-    """Return the parameter farthest from nominal, and how far in what is plausible (`PLAUSIBLE`)."""
+    """Return the parameter farthest from nominal, and its deviation in units of the plausible one (`PLAUSIBLE`)."""
     nominal = calibration.robot.nominal or calibration.chain
     plausible = [PLAUSIBLE[unit] for unit in nominal.units]
     sizes = np.abs(calibration.chain.values - nominal.values) / plausible

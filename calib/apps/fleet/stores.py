@@ -1,11 +1,13 @@
 """Sessions and studies in object storage or a shared folder, by addresses of fsspec (``s3://bucket/cell7``).
 
-Who works on one fetches its folder, works on the copy, and puts back what changed: every few seconds, and at the end;
-the files that say what is complete (`LAST`) after all others, whole or not at all. A killed process thus leaves what
-it had put back, and the next one goes on from there.
+A process that works on such a folder fetches it, works on the copy, and writes back changed files: every few seconds,
+and at the end; the files that mark a step as complete (`LAST`) after all others, whole or not at all. After a killed
+process the files that it had written back remain, and the next process continues from them.
 
-``calib.claim`` in the folder says who works on it, and is rewritten all the while. Where it has not changed for `LEASE`
-seconds its owner is gone, and the next one takes it over; an owner that was only slow then writes nothing more.
+The file ``calib.claim`` in the folder names the process that works on it, which rewrites the file all the time. Where
+it
+has not changed for `LEASE` seconds, the next process takes the folder over; the earlier one, if it was only slow, then
+writes nothing more.
 """
 
 from __future__ import annotations
@@ -31,12 +33,16 @@ LEASE = 20.0  # [s] that a claim may go unchanged (our choice)
 
 
 def is_address(path: object) -> bool:
-    """Return whether `place` is an address, and no path."""
+    """Return whether `path` is an address of fsspec rather than a path."""
     return "://" in str(path)
 
 
 def sessions(address: str) -> list[str]:
-    """Return the addresses of the sessions that match one with or without wildcards; empty for a path."""
+    """Return the addresses of the sessions that match an address with or without wildcards; empty for a path.
+
+    Raises:
+        UsageError: the storage cannot be read, or no session matches.
+    """
     if not is_address(address):
         return []
     files, root = _opened(address)
@@ -48,13 +54,14 @@ def sessions(address: str) -> list[str]:
 
 @contextmanager
 def held(address: str, lease: float = LEASE) -> Iterator[Path]:
-    """Yield a copy of the folder at an address, held for this process; what changes in it is put back.
+    """Yield a local copy of the folder at an address, claimed for this process; changed files are written back.
 
     Raises:
-        UsageError: where no storage is.
-        Busy: while another process works on it.
-        CalibError: where it cannot be read or written (another process took over; the storage is full). What was put
-            back before stays.
+        UsageError: there is no storage at the address.
+        Busy: another process works on the folder.
+        CalibError: it cannot be read or written (another process took over; the storage is full). Files that were
+            written
+            back before remain.
     """
     files, root = _opened(address)
     with refused_as(CalibError, Exception, f"cannot read or write {address}: {{}}; run the same command again"):
@@ -85,7 +92,7 @@ def _opened(address: str) -> tuple[Any, str]:
 
 
 class _Claim:
-    """The file that says who works on a folder; made by taking it."""
+    """The file that names the process working on a folder; creating the object takes the claim."""
 
     def __init__(self, files: Any, address: str, path: str, lease: float) -> None:
         self.files, self.address, self.path, self.beats = files, address, path, 0
@@ -107,14 +114,14 @@ class _Claim:
         self.files.pipe_file(self.path, f"{self.owner} {self.beats}".encode(), mode=mode)
 
     def _read(self) -> str | None:
-        """Return the claim's text; None where there is none."""
+        """Return the claim's text; None where there is no claim."""
         try:
             return self.files.cat_file(self.path).decode()
         except FileNotFoundError:
             return None
 
     def renew(self) -> None:
-        """Show that this process is alive; raise if another one took over."""
+        """Rewrite the claim, which shows that this process is alive; raise CalibError if another process took over."""
         holder = self._read() or ""
         message = f"{self.address} was taken over by {holder or 'nobody'}; nothing more was written there"
         require(holder.startswith(self.owner), message)
@@ -122,14 +129,14 @@ class _Claim:
         self._write("overwrite")
 
     def release(self) -> None:
-        """Give the folder free, if it is still ours."""
+        """Remove the claim if it still belongs to this process."""
         with refused_as(CalibError, Exception, f"cannot write {self.address}: {{}}"):
             if (self._read() or "").startswith(self.owner):
                 self.files.rm_file(self.path)
 
 
 class _Copy:
-    """A folder's copy on this machine, with what is known of its files at the address."""
+    """A local copy of a folder, with the last known state of its files at the address."""
 
     def __init__(self, files: Any, root: str, folder: Path, claim: _Claim) -> None:
         self.files, self.root, self.folder, self.claim = files, root, folder, claim
@@ -143,14 +150,16 @@ class _Copy:
         self.known = self._now()
 
     def _now(self) -> dict[str, tuple[int, int]]:
-        """Return what tells whether a file has changed, by name."""
+        """Return modification time [ns] and size [bytes] of each file of the copy, by name."""
         paths = (path for path in self.folder.rglob("*") if path.is_file() and path.suffix not in PASSING)
         return {
             path.relative_to(self.folder).as_posix(): (path.stat().st_mtime_ns, path.stat().st_size) for path in paths
         }
 
     def keep(self, stop: Event, period: float) -> None:
-        """Renew the claim and put back what changed until `stop`; what goes wrong is said when the work ends."""
+        """Renew the claim and write back changed files every `period` seconds until `stop`; errors are reported at the
+        end only.
+        """
         while not stop.wait(period):
             try:
                 self.put_back()
@@ -158,7 +167,7 @@ class _Copy:
                 continue
 
     def put_back(self) -> None:
-        """Write what changed, `LAST` last."""
+        """Write changed files to the address, those in `LAST` last."""
         self.claim.renew()
         state = self._now()
         changed = [name for name in state if state[name] != self.known.get(name)]

@@ -11,13 +11,13 @@ from calib.workers import Workers
 
 
 class Throughput:
-    """Seconds of every task by worker (host and process), since it was made."""
+    """Durations [s] of every task by worker (host and process), since this object was made."""
 
     def __init__(self) -> None:
         self.began, self.spent = time.monotonic(), dict[str, list[float]]()
 
     def completed(self, crew: Workers, function: Callable[..., object], tasks: Iterable[object]) -> Iterator[tuple]:
-        """Yield (number of the task, its result) as `Workers.completed` does, noting who ran it."""
+        """Yield (number of the task, its result) as `Workers.completed` does, noting the worker and its time."""
         for number, answer in crew.completed(partial(_signed, function), tasks):
             if isinstance(answer, TaskLost):
                 yield number, answer
@@ -27,7 +27,7 @@ class Throughput:
             yield number, result
 
     def lines(self, limit: int = 8) -> list[str]:
-        """Return a line per worker, the slowest first; none for a single worker."""
+        """Return one line per worker, the slowest first, at most `limit`; none for a single worker."""
         minutes = max((time.monotonic() - self.began) / 60.0, 1e-9)
         ranked = sorted(self.spent.items(), key=lambda item: len(item[1]))
         if len(ranked) < 2:
@@ -45,7 +45,7 @@ class Throughput:
 
 
 def _signed(function: Callable[..., object], task: object) -> tuple[object, str, float]:
-    """Run a task; return its result, who ran it, and the seconds of wall time."""
+    """Run a task; return its result, the worker (host and process), and the wall-clock time [s]."""
     started = time.monotonic()
     result = function(task)
     return result, f"{socket.gethostname()}:{os.getpid()}", time.monotonic() - started

@@ -1,4 +1,4 @@
-"""Tools of a fleet: is one that several arms share bent or loose, by what those arms show against all others?"""
+"""Tools of a fleet: whether a tool that several arms share is bent or loose, judged against arms with other tools."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,15 +24,19 @@ MIN_TIMES = 1.5
 
 @dataclass(frozen=True)
 class ToolUse:
-    """What arms with one tool show, against arms of the same type with others.
+    """Comparison of the arms with one tool with arms of the same type that have other tools.
 
     Attributes:
         tool: its name in the measurements (``tool`` of the options file).
-        arms: their names.
-        moved: distance of its median position from that of the others [m].
-        moved_sigmas: deviation of a normal variable that is as unlikely, as arms with one tool differ among themselves.
-        times: median rms error, divided by that of the others.
-        times_sigmas: of its logarithm, the same; all four are None where too few arms are compared.
+        arms: names of the arms with this tool.
+        moved: distance of the tool's median position from that of the other tools [m].
+        moved_sigmas: significance of `moved`, as the deviation of a normal variable that is as unlikely, given the
+            scatter
+            among arms with one tool.
+        times: median rms error of these arms, divided by that of the other arms.
+        times_sigmas: significance of log(times), in the same sense as `moved_sigmas`. All four are None where too few
+            arms
+            are compared.
     """
 
     tool: str
@@ -43,7 +47,7 @@ class ToolUse:
     times_sigmas: float | None = None
 
     def findings(self) -> list[Finding]:
-        """Return that the tool is bent, or loose."""
+        """Return the finding that the tool is bent or loose; empty where it is neither."""
         bent = loose = None
         if self.moved_sigmas is not None and self.moved_sigmas > SIGMAS:
             bent = self.moved
@@ -55,10 +59,10 @@ class ToolUse:
 
 
 def tools(tool_uses: Mapping[str, tuple[str, np.ndarray, float]]) -> list[ToolUse]:
-    """Return what each tool's arms show.
+    """Return the comparison for each tool.
 
     Args:
-        tool_uses: arm → (tool, its position (3,) in the tip's frame [m], rms error of the calibrated arm [m]).
+        tool_uses: arm to (tool, its position (3,) in the tip's frame [m], rms error of the calibrated arm [m]).
     """
     names = sorted({tool for tool, _, _ in tool_uses.values()})
     return [_use(name, tool_uses) for name in names]
@@ -94,10 +98,10 @@ def _use(name: str, tool_uses: Mapping[str, tuple[str, np.ndarray, float]]) -> T
 
 
 def _sigmas(step: np.ndarray, groups: Sequence[np.ndarray]) -> float:
-    """Return how unlikely the difference `step` (k,) of two groups' medians is, as deviation of a normal variable.
+    """Return the significance of the difference `step` (k,) of two groups' medians, as deviation of a normal variable.
 
-    The scatter is that of the arms (n, k) about the median of their own group, as if all of it were along the
-    difference: a tool's position scatters most along the last axis, where it cannot be told from the arm's last link.
+    The scatter is that of the arms (n, k) about the median of their group, as if all of it were along the difference: a
+    tool's position scatters most along the last axis, where it cannot be separated from the arm's last link.
     """
     distances = []
     freedom = 0

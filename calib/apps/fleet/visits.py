@@ -1,4 +1,4 @@
-"""Calibrations of a fleet by arm: which are finished, which are of one arm, and in what order of time."""
+"""Calibrations of a fleet by arm: finished ones only, grouped by serial number, in order of time."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,8 +19,10 @@ class Visits:
     """The finished calibrations of a fleet.
 
     Attributes:
-        by_arm: serial number, or the name of a calibration that states none → that arm's calibrations, earliest first.
-        noticed: what was left out, counts as an arm of its own, or is taken as an arm's current calibration.
+        by_arm: serial number, or the name of a calibration that states none, to that arm's calibrations, earliest
+            first.
+        noticed: findings on calibrations that were left out, count as separate arms, or are taken as an arm's current
+            one.
     """
 
     by_arm: Mapping[str, Sequence[Calibration]]
@@ -34,7 +36,7 @@ def visits(calibrations: str | Path | Sequence[str | Path]) -> Visits:
         calibrations: folders of fits or sessions.
 
     Raises:
-        UsageError: for a folder that holds no fit, or one given twice; where one or none is left.
+        UsageError: a folder that holds no fit or is given twice, or fewer than two finished calibrations.
     """
     places = [place_of(folder, "fleet") for folder in folders_of(calibrations)]
     unfinished: list[str] = []
@@ -78,9 +80,9 @@ def visits(calibrations: str | Path | Sequence[str | Path]) -> Visits:
 
 
 def _dates(arm_visits: Sequence[Visit]) -> tuple[str, list[date]]:
-    """Return what the dates of one arm's calibrations are of, and the dates; none where some are not known.
+    """Return what one arm's dates refer to (measurement or session), and the dates; no dates where some are not known.
 
-    Dates of measurement where any is stated, else those on which the sessions were made.
+    Dates of measurement are taken where any is stated, else those on which the sessions were made.
     """
     settings = [source.session.settings for source, _ in arm_visits if source.session]
     dated_thing = "measurement"
@@ -98,7 +100,7 @@ def _dates(arm_visits: Sequence[Visit]) -> tuple[str, list[date]]:
 
 
 def _in_time(arm_visits: Sequence[Visit]) -> list[Visit]:
-    """Return one arm's calibrations, earliest first; those of one day, and those without dates, as they were given."""
+    """Return one arm's calibrations, earliest first; those of one day, and those without dates, in the given order."""
     _, dates = _dates(arm_visits)
     if not dates:
         return list(arm_visits)
@@ -107,7 +109,7 @@ def _in_time(arm_visits: Sequence[Visit]) -> list[Visit]:
 
 
 def _current(arm: str, arm_visits: Sequence[Visit]) -> Finding:
-    """Return which of one arm's calibrations is taken as the current one, and why."""
+    """Return the finding that names the calibration taken as an arm's current one, and the reason."""
     dated_thing, dates = _dates(arm_visits)
     current = _in_time(arm_visits)[-1][1].name
     last = arm_visits[-1][1].name

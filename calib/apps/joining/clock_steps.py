@@ -1,10 +1,13 @@
-"""A step of a clock inside a stream, or its wandering, which a line through the offsets would pass for drift.
+"""A step of a clock inside a stream, or its wandering, which a line through the offsets would mistake for drift.
 
-About the fit of clock and arm (`calib.apps.joining.clocks.fitted`) the offset is let change at a time T by a size
-that is free, with all that was fitted, and backlash, free beside it: what least squares then say of the size, in its σ,
-is largest at the true T. A clock that wanders smoothly (temperature) makes sizes at many T: a step must explain more
-than a polygon of `KNOTS` offsets does, or stand out beside the polygon. Where the rows' stamps depart from an even step
-by that size, the file and the row are known. Thresholds are our choice.
+About the fit of clock and arm (`calib.apps.joining.clocks.fitted`) the offset may change at a time T by a free size;
+all
+fitted parameters, and backlash, are free too. The least-squares estimate of the size, divided by its σ, is largest at
+the
+true T. A clock that wanders smoothly (temperature) gives sizes at many T: a step must explain more than a polygon of
+`KNOTS` offsets does, or be significant beside the polygon. Where the stamps of the rows depart from an even step by
+that
+size, the file and the row of the step are known. Thresholds are our choice.
 """
 
 from __future__ import annotations
@@ -35,9 +38,10 @@ class Equations:
     """Whitened least squares about a fit of clock and arm.
 
     Attributes:
-        matrix, target: (rows + priors, p) in any units, and (rows + priors,) what they are to explain.
-        offset_slope: (rows,) change per second of the clock's offset.
-        backlash_slopes: (rows, joints) change per rad or m of backlash.
+        matrix: (rows + priors, p), parameters in any units.
+        target: (rows + priors,) right-hand side.
+        offset_slope: (rows,) derivative by the clock's offset [1/s].
+        backlash_slopes: (rows, joints) derivative by each joint's backlash [1/rad or 1/m].
         t: (rows,) the instrument's times [s].
     """
 
@@ -50,17 +54,20 @@ class Equations:
 
 @dataclass(frozen=True)
 class Step:
-    """Change of the instrument's clock against the controller's by `size` ± `sigma` [s], at its `time` [s]."""
+    """Change of instrument's clock against the controller's by `size` ± `sigma` [s] at the instrument's `time` [s]."""
 
     time: float
     size: float
     sigma: float
 
     def place(self, log: Stream, stream: Stream, log_time: float) -> str:
-        """Return the file whose stamps show the step, with time and row; or the times in both, where none does.
+        """Return the file whose stamps show the step, with time and row; where neither shows it, the times in both
+        files.
 
         Args:
-            log_time: of the step by the controller's clock, about [s].
+            log: the controller's log.
+            stream: the instrument's stream.
+            log_time: approximate time of the step by the controller's clock [s].
         """
         stream_misfit, stream_row = self._stamp(stream, self.size, self.time)
         log_misfit, log_row = self._stamp(log, -self.size, log_time)
@@ -72,7 +79,9 @@ class Step:
         return stream_row
 
     def _stamp(self, file: Stream, size: float, time: float) -> tuple[float, str]:
-        """Return how far the stamps of a file differ from a step of `size` near `time` [s], as a share, and the row."""
+        """Return the misfit of a file's stamps to a step of `size` [s] near `time` [s], as a share of `size`, and its
+        row.
+        """
         intervals = np.diff(file.t)
         row_counts = np.diff(file.rows)
         even_step = np.median(intervals / row_counts)
@@ -88,9 +97,10 @@ class Step:
 
 
 def find_step(equations: Equations) -> tuple[Step | None, float]:
-    """Return the step that stands out most, None where there is none, and by how much the clock leaves its line [s].
+    """Return the most significant step, None without one, and the clock's deviation from a line of offset and drift
+    [s].
 
-    The second is 0 where a line is as good as a polygon.
+    The deviation is 0 where a line is as good as a polygon.
     """
     begin, end = float(equations.t.min()), float(equations.t.max())
     # the polygon: offsets at the inner knots, each with a hat function of the time
@@ -120,7 +130,9 @@ def find_step(equations: Equations) -> tuple[Step | None, float]:
 
 
 def _search(equations: Equations, beside: np.ndarray) -> tuple[Step, float]:
-    """Return the most certain step at any time, coarsely, then closely, and the sum of squares that it explains."""
+    """Return the most significant step at any time, and the sum of squares that it explains; searched coarsely, then
+    closely.
+    """
     begin, end = float(equations.t.min()), float(equations.t.max())
     times, spacing = np.linspace(begin, end, COARSE_TIMES + 2, retstep=True)
     coarse, _ = _best(equations, times[1:-1], beside)
@@ -129,10 +141,12 @@ def _search(equations: Equations, beside: np.ndarray) -> tuple[Step, float]:
 
 
 def _best(equations: Equations, times: np.ndarray, beside: np.ndarray) -> tuple[Step, float]:
-    """Return the most certain of steps at `times` (k,), and the sum of squares that it explains.
+    """Return the most significant of steps at `times` (k,) [s], and the sum of squares that it explains.
 
     Args:
-        beside: (n, rows) other changes of the offset [s] that are free.
+        equations: the fit.
+        times: the instrument's times of the steps [s].
+        beside: (n, rows) other changes of the offset [s], whose sizes are free.
     """
     steps = equations.t > times[:, None]
     errors, *columns = _projected(equations, [*beside, *steps])
@@ -154,7 +168,13 @@ def _best(equations: Equations, times: np.ndarray, beside: np.ndarray) -> tuple[
 
 
 def _projected(equations: Equations, changes: list[np.ndarray]) -> np.ndarray:
-    """Return what all that is free cannot explain of the data (first row), and of changes (rows,) of the offset."""
+    """Return residuals after projecting out all free parameters: of the target (first row), and of each change of the
+    offset.
+
+    Args:
+        equations: the fit.
+        changes: changes (rows,) of the offset [s].
+    """
     rows, joints = equations.backlash_slopes.shape
     count = len(equations.target)
     # the fit's own equations, and backlash of each joint with its prior

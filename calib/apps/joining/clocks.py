@@ -1,11 +1,12 @@
 """Clock of an instrument against a controller's, from points measured while the arm moves.
 
-A point at the instrument's time t belongs to the joints q(t - offset - drift (t - middle)) of the log. Where to begin
-is found without any frame: the speed of the nominal arm's tip against that of the points, at every offset
-(cross-correlation); the best few are tried by placing instrument and target. Then offset, drift, both placements and
-the arm's geometry are fitted together (Gauss-Newton), since the errors of an arm would else pass for those of a clock.
-How large the terms of an effect may be is found from the data (`calib.estimation.relevance`): by a size that is given,
-σ of the clock is too large for arms with less of it, and too small for arms with more. Thresholds are our choice.
+A point at the instrument's time t belongs to the joints q(t - offset - drift (t - middle)) of the log. Start values are
+found without any frame: the speed of the nominal arm's tip is correlated with that of the points at every offset; the
+best few offsets are tried by placing instrument and target. Then offset, drift, both placements and the arm's geometry
+are fitted together (Gauss-Newton), since errors of the arm would otherwise be taken for errors of the clock. The prior
+size of an effect's terms is estimated from the data (`calib.estimation.relevance`): with a fixed size, σ of the clock
+is
+too large for arms with smaller effects, and too small for arms with larger ones. Thresholds are our choice.
 """
 
 from __future__ import annotations
@@ -77,8 +78,8 @@ class Clock:
 
     Attributes:
         offset, sigma: the instrument's time minus the controller's at `middle`, and its standard deviation [s].
-        drift, drift_sigma: change of the offset with time [s/s].
-        middle: time of the instrument [s].
+        drift, drift_sigma: change of the offset with time, and its standard deviation [s/s].
+        middle: the instrument's time to which `offset` refers [s].
     """
 
     offset: float
@@ -94,11 +95,12 @@ class Clock:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A motion as both recordings have it.
+    """A motion in both recordings.
 
     Attributes:
         log: the controller's joints.
-        stream: the instrument's rows; `points` are these as measurements, without their joints.
+        stream: the instrument's rows.
+        points: these rows as measurements, without joint values.
     """
 
     log: Stream
@@ -110,13 +112,17 @@ class Run:
         return CubicSpline(self.log.t, self.log.values)
 
     def joints(self, clock: Clock, rows: np.ndarray, order: int = 0) -> np.ndarray:
-        """Return the log's joints (m, n) at the times of rows, or a derivative; outside the log those of its ends."""
+        """Return the log's joint values (m, n) at the times of rows, or their derivative of an order; beyond the log,
+        its ends.
+        """
         times = clock.controller(self.stream.t[rows])
         start, end = self.log.t[[0, -1]]
         return self._path(np.clip(times, start, end), order)
 
     def known(self, clock: Clock, count: int | None = None) -> np.ndarray:
-        """Return the rows whose times are between two of the log that are no gap apart; evenly `count` of them."""
+        """Return the rows whose times lie between two rows of the log without a gap; `count` of them, evenly, or all
+        for None.
+        """
         log = self.log
         t = clock.controller(self.stream.t)
         after = np.clip(np.searchsorted(log.t, t), 1, len(log.t) - 1)
@@ -128,11 +134,11 @@ class Run:
         return rows[evenly(len(rows), count)]
 
     def lines(self) -> list[str]:
-        """Return what is to be said of both files."""
+        """Return the remarks on both files."""
         return [*self.log.lines(), *self.stream.lines()]
 
     def at(self, clock: Clock, rows: np.ndarray) -> Positions:
-        """Return rows as measurements with their joints."""
+        """Return the given rows as measurements with their joint values."""
         return replace(take(self.points, rows), q=self.joints(clock, rows))
 
 
@@ -146,10 +152,10 @@ class _Start:
 
 
 def begin(chain: Chain, run: Run) -> tuple[Installation, Clock, tuple[float, ...]]:
-    """Return the nominal arm placed, the clock to begin with, and other offsets that are as good [s].
+    """Return the nominal arm placed, the clock to begin with, and other offsets that fit as well [s].
 
     Raises:
-        MeasurementError: where no offset brings the points onto the nominal arm's path.
+        MeasurementError: no offset brings the points onto the nominal arm's path.
     """
     middle = float(run.stream.t[[0, -1]].mean())
     starts = list[_Start]()
@@ -186,7 +192,7 @@ def begin(chain: Chain, run: Run) -> tuple[Installation, Clock, tuple[float, ...
 
 
 def _offsets(chain: Chain, run: Run) -> list[float]:
-    """Return offsets of the clocks [s] at which the speeds of the arm and of the points go together."""
+    """Return offsets of the clocks [s] at which the speeds of the arm and of the points correlate."""
     arm = forward(chain, _even(run.log))
     arm_steps = _step_lengths(arm[:, :3, 3])
     rotations = invert(arm[:-1])[:, :3, :3] @ arm[1:, :3, :3]
@@ -220,14 +226,14 @@ def _step_lengths(positions: np.ndarray) -> np.ndarray:
 
 
 def _even(stream: Stream) -> np.ndarray:
-    """Return a stream's values (m, k) on the grid of the offsets."""
+    """Return a stream's values (m, k) interpolated at even times, `GRID` [s] apart."""
     t = np.arange(stream.t[0], stream.t[-1], GRID)
     columns = [np.interp(t, stream.t, column) for column in stream.values.T]
     return np.column_stack(columns)
 
 
 def _cut(speed: np.ndarray) -> np.ndarray:
-    """Return speeds (m,) about their median, jumps cut."""
+    """Return speeds (m,) minus their median, with jumps clipped."""
     return np.minimum(speed, 2.0 * np.quantile(speed, 0.95)) - np.median(speed)
 
 
@@ -245,14 +251,14 @@ def _alike(series_a: np.ndarray, series_b: np.ndarray) -> np.ndarray:
 
 
 def residuals(cell: Installation, run: Run, rows: np.ndarray, clock: Clock) -> np.ndarray:
-    """Return the residuals (3 or 6, m) of rows: of positions [m], then of orientations [rad]."""
+    """Return the residuals (3 or 6, m) of rows: positions [m], then orientations [rad]."""
     (block,) = prepare(cell, [run.at(clock, rows)])
     parts = observe(cell, block, _NONE)
     return np.concatenate([part.value for part in parts])
 
 
 def velocities(cell: Installation, run: Run, rows: np.ndarray, clock: Clock) -> np.ndarray:
-    """Return the velocities (3 or 6, m) [m/s, then rad/s] of the target at rows, as the installation's arm moves it."""
+    """Return velocities (3 or 6, m) [m/s, then rad/s] of the target at rows, by the installation's arm and the log."""
     later = replace(clock, offset=clock.offset + TIME_STEP)
     sooner = replace(clock, offset=clock.offset - TIME_STEP)
     difference = residuals(cell, run, rows, later) - residuals(cell, run, rows, sooner)
@@ -262,7 +268,9 @@ def velocities(cell: Installation, run: Run, rows: np.ndarray, clock: Clock) -> 
 def fitted(
     cell: Installation, run: Run, rows: np.ndarray, clock: Clock, arm: bool = True, backlash: bool = False
 ) -> tuple[Installation, Clock, Equations]:
-    """Return the installation and the clock that fit some rows best, and the last equations; σ is of independent rows.
+    """Return the installation and the clock that fit the given rows best, and the last equations.
+
+    σ of the clock holds for independent rows.
 
     Args:
         cell, clock: where to start: the nominal arm, about which its parameters have a wide prior.
@@ -357,12 +365,12 @@ def fitted(
 def _sized(
     matrix: np.ndarray, target: np.ndarray, pulled: np.ndarray, guess: np.ndarray, group: np.ndarray
 ) -> np.ndarray:
-    """Return the prior standard deviations (p,), those of a family of terms by the factor that is most probable.
+    """Return the prior standard deviations (p,); those of a family of terms are scaled by the most probable factor.
 
     Args:
         matrix, target: whitened rows of the data, (rows, p) and (rows,).
         pulled: (p,) the prior's mean minus the present values.
-        guess: (p,) prior standard deviations as they were guessed.
+        guess: (p,) prior standard deviations before scaling.
         group: (p,) number of a term's family; -1 for other columns.
     """
     ungrouped = group < 0

@@ -15,7 +15,7 @@ CLOCKS = ("t", "time", "timestamp", "datetime")
 
 
 def column_of(table: Table, names: Sequence[str]) -> str:
-    """Return the table's first column that has one of the `names`, in any spelling; "" without any."""
+    """Return the table's first column that has one of the `names`, in any spelling; empty if it has none."""
     # of two columns with the same plain name the first
     plain = dict[str, str]()
     for name in table.header:
@@ -28,12 +28,12 @@ def column_of(table: Table, names: Sequence[str]) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Joined:
-    """Joint values and points in one table, with what there is to say of it.
+    """Joint values and points in one table.
 
     Attributes:
-        table: one row per pose that was measured.
-        poses: the index of each row's pose among the joints; by motion, of its point in the points' file.
-        notes: how it was joined, what is missing.
+        table: one row per measured pose.
+        poses: index of each row's pose among the joints; by motion, of its point in the points' file.
+        notes: how the files were joined, and what is missing.
     """
 
     table: Table
@@ -41,7 +41,7 @@ class Joined:
     notes: tuple[str, ...]
 
     def write(self, path: Path) -> Path:
-        """Write the table as CSV, the notes as comments above it."""
+        """Write the table as CSV with the notes as comments above it, and return its path."""
         header = []
         for name, unit in zip(self.table.header, self.table.units):
             header.append(f"{name} [{unit}]" if unit else name)

@@ -83,15 +83,15 @@ def join(
         points: CSV file of measured points.
         by: ``name``, ``time``, ``row``, ``geometry`` or ``motion``; empty: the first of these that both files have
             columns for, but not ``motion``.
-        robot, base, tip: the nominal robot, as of `calib.load`, whose geometry checks the order, or finds it.
+        robot, base, tip: the nominal robot, as for `calib.load`, by whose geometry the order is checked or found.
 
     Returns:
         The table, the index of each row's pose, and notes; ``write(path)`` writes the CSV that `fit_geometry` takes. By
         motion, also the clock (`calib.apps.joining.streams.Streamed`).
 
     Raises:
-        UsageError: for another `by`, or one that the files have no columns for.
-        MeasurementError: where the files do not go together.
+        UsageError: an unknown `by`, one for which the files have no columns, or ``motion`` without a robot.
+        MeasurementError: the files do not belong together.
     """
     one_of(by or "row", METHODS, "by", UsageError)
     joints_file, points_file = Path(joints), Path(points)
@@ -147,7 +147,7 @@ def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joine
 def ordered(
     chain: Chain, q: np.ndarray, points: Table, candidates: dict[str, np.ndarray], sheet: Sheet | None = None
 ) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return which of the poses q (n, joints) each point belongs to, -1 for none, and notes on it.
+    """Return the index (m,) of each point's pose among q (n, joints), -1 for none, and notes on the order.
 
     Args:
         candidates: orders to try first, in words → (m,) index of each point's pose.
@@ -204,7 +204,7 @@ def merged(
     keys: Collection[str],
     name_missing: bool = True,
 ) -> Joined:
-    """Return the joints' rows with the points (m,) of each, several readings of one pose averaged.
+    """Return the joints' rows joined with their points, several readings of one pose averaged.
 
     Args:
         pose: (m,) index of each point's row of joints; -1 for none.
@@ -261,7 +261,7 @@ def merged(
 
 
 def _positions(sheet: Sheet) -> np.ndarray:
-    """Return the measured positions (m, 3) [m], of several targets those of the first; NaN where it was not seen."""
+    """Return measured positions (m, 3) [m], of several targets those of the first; NaN where it was not measured."""
     columns = sheet.family(POSITION.names) or sheet.family(POSITION.names, "1")
     if not columns:
         refuse_data(sheet.table.file, f"has no x, y, z; found {', '.join(sheet.table.header)}")
@@ -271,7 +271,7 @@ def _positions(sheet: Sheet) -> np.ndarray:
 def _consistent(
     position: np.ndarray, groups: dict[int, np.ndarray], label: Sequence[str], points: Table
 ) -> tuple[dict[int, np.ndarray], list[str]]:
-    """Return the groups of readings without those whose readings contradict each other, and what is to be said."""
+    """Return the groups of readings without those whose readings contradict each other, and remarks on the latter."""
     distances = {}
     for k, rows in groups.items():
         if len(rows) > 1:
@@ -290,7 +290,10 @@ def _consistent(
 
 
 def _averaged(points: Table, name: str, groups: dict[int, np.ndarray], position: np.ndarray) -> np.ndarray:
-    """Return a column of points, one cell per group: the mean of positions, else of the reading nearest the mean."""
+    """Return a column of points, one cell per group: the mean of measured numbers, else the cell of the reading nearest
+    to
+    the mean position.
+    """
     cells = points.cells[points.index(name)]
     if _MEASURED.fullmatch(name) and cells.dtype == float:
         return np.array([cells[rows].mean() for rows in groups.values()])
@@ -303,7 +306,7 @@ def _averaged(points: Table, name: str, groups: dict[int, np.ndarray], position:
 
 
 def _labels(joints: Table) -> list[str]:
-    """Return a name per row of joints: those of its column of names, else its numbers from 1."""
+    """Return a name for each row of joints: from the column of names, else the row numbers from 1."""
     name = column_of(joints, NAMES)
     if name:
         return joints.texts(name)
@@ -311,7 +314,7 @@ def _labels(joints: Table) -> list[str]:
 
 
 def _same_names(joints: Table, points: Table, joint_column: str, point_column: str) -> np.ndarray:
-    """Return the row of joints (m,) with each point's name, -1 without one."""
+    """Return the row of joints (m,) that has each point's name, -1 where none has."""
     point_names = points.texts(point_column)
     joint_names = joints.texts(joint_column)
     # first by the whole names, then by their numbers
@@ -326,7 +329,7 @@ def _same_names(joints: Table, points: Table, joint_column: str, point_column: s
 
 
 def _plain(text: str) -> str:
-    """Return a name in comparable form: small letters and digits, without zeros in front: ``P_007`` is ``p7``."""
+    """Return a name in comparable form: lower-case letters and digits, without leading zeros: ``P_007`` is ``p7``."""
     plain = re.sub(r"[^a-z0-9]", "", text.lower())
     return re.sub(r"(?<!\d)0+(?=\d)", "", plain)
 
@@ -340,7 +343,7 @@ def _number(text: str) -> str:
 def _at_times(
     joints: Table, points: Table, joint_column: str, point_column: str
 ) -> tuple[Table, np.ndarray, tuple[str, ...]]:
-    """Return the joints at the times of the points, which of them stood still (m,), and notes."""
+    """Return joints at the times of the points, the pose index (m,) of each point (-1 if the arm moved), and notes."""
     t = _seconds(joints, joint_column)
     point_times = _seconds(points, point_column)
     not_after = np.flatnonzero(np.diff(t) <= 0.0)

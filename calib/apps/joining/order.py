@@ -46,12 +46,12 @@ MAX_TRIPLES = 20_000
 
 @dataclass(frozen=True, eq=False)
 class Order:
-    """Poses that m points belong to.
+    """Poses to which m points belong.
 
     Attributes:
         pose: (m,) index of each point's pose, -1 where it belongs to none; several readings of one pose share it.
         error: (m,) distance of each point from the nominal arm's point in that pose [m].
-        rivals: points that could as well belong to another pose: their indices.
+        rivals: indices of points that could as well belong to another pose.
         origin: how the order was found, in words.
     """
 
@@ -62,13 +62,13 @@ class Order:
 
     @property
     def rms(self) -> float:
-        """Root mean square of the errors [m], of the points that belong to a pose."""
+        """Root mean square of the errors of the points that belong to a pose [m]."""
         errors = self.error[self.pose >= 0]
         return float(np.sqrt(np.mean(errors**2)))
 
 
 def find_order(chain: Chain, q: np.ndarray, points: np.ndarray, candidates: dict[str, np.ndarray]) -> Order | None:
-    """Return which of the poses q (n, joints) each of the points (m, 3) [m] belongs to; None if no order explains them.
+    """Return the pose among q (n, joints) of each of the points (m, 3) [m]; None if no order explains the points.
 
     Args:
         chain: the nominal arm.
@@ -104,7 +104,7 @@ def find_order(chain: Chain, q: np.ndarray, points: np.ndarray, candidates: dict
 def _orders_from(
     chain: Chain, q: np.ndarray, points: np.ndarray, starts: Iterable[np.ndarray], limit: float
 ) -> list[Order]:
-    """Return the orders that some starts lead to, up to the first in which nearly all points belong to a pose."""
+    """Return the orders refined from each start, up to the first in which nearly all points belong to a pose."""
     orders = list[Order]()
     for pose in starts:
         order = _refined(chain, q, points, pose, limit)
@@ -119,7 +119,7 @@ def _orders_from(
 def _refined(
     chain: Chain, q: np.ndarray, points: np.ndarray, pose: np.ndarray, limit: float, prefer: np.ndarray | None = None
 ) -> Order | None:
-    """Return the order that a first order leads to, None if most of the points then belong to no pose."""
+    """Return the order refined from the start `pose`; None if most of the points then belong to no pose."""
     rounds = 0
     while True:
         assigned = np.flatnonzero(pose >= 0)
@@ -154,7 +154,10 @@ def _refined(
 def _predicted(
     chain: Chain, q: np.ndarray, points: np.ndarray, pose: np.ndarray, assigned: np.ndarray
 ) -> np.ndarray | None:
-    """Return the points (n, 3) of all poses after placing instrument and target by the `assigned` points."""
+    """Return the nominal points (n, 3) [m] of all poses, instrument and target placed by the `assigned` points; None if
+    these
+    do not determine the placement.
+    """
     block = PoseMeasurements.of(q[pose[assigned]], points[assigned], joint_names=chain.joint_names)
     try:
         cell = install(chain, [block])
@@ -165,7 +168,11 @@ def _predicted(
 
 
 def _assigned(cost: np.ndarray, bound: float, prefer: np.ndarray | None) -> np.ndarray:
-    """Return the pose (m,) of each point by the assignment of least total clipped cost; -1 at costs beyond `bound`."""
+    """Return the pose (m,) of each point by the assignment of least total clipped cost; -1 where the cost exceeds
+    `bound`.
+
+    `prefer` (m,) are poses taken where their cost is below `bound`, -1 for none; None: no preference.
+    """
     clipped = np.minimum(cost, bound)
     if prefer is not None:
         # a stated order holds wherever it is possible
@@ -179,7 +186,7 @@ def _assigned(cost: np.ndarray, bound: float, prefer: np.ndarray | None) -> np.n
 
 
 def _by_distances(arm: np.ndarray, points: np.ndarray, tools: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    """Yield orders to start from, by distances between points: the best of many triples of poses."""
+    """Yield start orders (m,) from distances between points: the best of many triples of poses."""
     rng = np.random.default_rng(0)
     scored_points = rng.permutation(len(points))[:SCORED]
     bound = 0.06 * float(np.linalg.norm(np.std(points, axis=0)))
@@ -208,7 +215,7 @@ def _tool_points(arm: np.ndarray, tool: np.ndarray) -> np.ndarray:
 
 
 def _tools(arm: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
-    """Return offsets (3,) of the target in the tip's frame [m] with which distances between points agree best."""
+    """Return offsets (3,) of the target in the tip's frame [m] for which distances between points agree best."""
     share = np.linspace(0.02, 0.98, 60)
     measured = np.quantile(pdist(points), share)
 

@@ -35,6 +35,9 @@ STEP = 1e-6
 def read_planned(path: Path, chain: Chain, options: FileOptions) -> list[PoseMeasurements]:
     """Return the points of the file at `path` with the joints of the poses planned in ``options.planned``.
 
+    The poses are those whose numbers the points' names contain, else those in the list's order; where the nominal arm
+    contradicts both, the order is found from it (`calib.apps.joining.order`).
+
     The poses are those that the points' names number, else those in the list's order; where the nominal arm
     contradicts both, their order is found from it (`calib.apps.joining.order`).
 
@@ -76,7 +79,7 @@ def read_planned(path: Path, chain: Chain, options: FileOptions) -> list[PoseMea
 
 
 def _stated_orders(points: Table, count: int) -> dict[str, np.ndarray]:
-    """Return the orders that the file itself may state, in words → (m,) index of the pose."""
+    """Return orders that the file may state, by names or by rows: description to index (m,) of each point's pose."""
     orders = dict[str, np.ndarray]()
     name = column_of(points, NAMES)
     if name:

@@ -1,9 +1,10 @@
-"""Files of rows over time (a tracker's stream, a controller's log): read in pieces, and what cannot be used counted.
+"""Files of rows over time (a tracker's stream, a controller's log), read in pieces; unusable rows are counted.
 
-A row is left out where a cell that is needed is no number or beyond what it can be, where all are zero (a tracker that
-saw nothing), where its cells are too few or too many, and where its time is not after all times before. A clock that
-goes back and runs on from there was restarted: refused, since half of the rows would be left out. Of the rest only as
-many are held as the resolution asks for, and `HELD` at most, so that memory is bounded.
+A row is left out where a required cell is not a number or out of range, where all cells are zero (the tracker lost its
+target), where the number of cells is wrong, and where its time is not later than all times before. A clock that goes
+back
+and continues from there was restarted: the file is refused, since half of its rows would be left out. Of the other rows
+only as many are kept as the resolution asks for, and at most `HELD`, so that memory is bounded.
 """
 
 from __future__ import annotations
@@ -40,16 +41,16 @@ DAMAGED, LATE = "damaged, empty or not seen", "with a time not after the row bef
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """Rows of a file over time that can be used.
+    """The usable rows of a file over time.
 
     Attributes:
         file: its path.
         t: (m,) times, rising [s].
         values: (m, k) [SI].
-        rows: (m,) their numbers in the file, from 1.
-        step: time between two of them [s].
+        rows: (m,) row numbers in the file, from 1.
+        step: median time between two rows [s].
         read: number of rows in the file.
-        dropped: reason → number of rows left out.
+        dropped: reason to number of rows left out.
     """
 
     file: str
@@ -62,11 +63,11 @@ class Stream:
 
     @property
     def gap(self) -> float:
-        """Time between two rows from which on nothing is known between them [s]."""
+        """Time between two rows above which the values between them count as unknown [s]."""
         return max(GAP, 5.0 * self.step)
 
     def lines(self) -> list[str]:
-        """Return what is to be said of the file's rows."""
+        """Return the remarks on the file's rows."""
         name = Path(self.file).name
         summary = f"{name}: {self.read} rows, {self.t[-1] - self.t[0]:.4g} s"
         reasons = _reasons(self.dropped)
@@ -82,14 +83,14 @@ class Stream:
 
 @dataclass(frozen=True)
 class Kind:
-    """What is read from a file, besides its times.
+    """How the values of a file's rows are read.
 
     Attributes:
-        names: table → its columns that are needed.
-        values: table of numbers → (m, k) [SI].
-        sound: values → which rows (m,) can be.
-        refuse: table, values; raises where most of them cannot be, with the likely cause.
-        resolution: time between the rows that are held, about [s].
+        names: table to the names of its required columns.
+        values: table of numbers to values (m, k) [SI].
+        sound: values to whether each row (m,) is possible.
+        refuse: (table, values); raises MeasurementError where most rows are impossible, with the likely cause.
+        resolution: approximate time between the rows that are kept [s].
     """
 
     names: Callable[[Table], Sequence[str]]
@@ -110,29 +111,30 @@ class _Jump:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """Times (m,), values (m, k) and numbers (m,) of the rows that are held of a piece."""
+    """Times (m,) [s], values (m, k) and row numbers (m,) of the rows kept from a piece of a file."""
 
     t: np.ndarray
     values: np.ndarray
     rows: np.ndarray
 
     def every(self, stride: int) -> _Part:
-        """Return every so many of the file's rows."""
+        """Return the rows whose number in the file is a multiple of `stride`, counted from row 1."""
         multiple = (self.rows - 1) % stride == 0
         return _Part(self.t[multiple], self.values[multiple], self.rows[multiple])
 
 
 def _reasons(dropped: Counter[str]) -> str:
-    """Return how many rows are left out for each reason; empty where none is."""
+    """Return as text how many rows were left out for each reason; empty if none was."""
     return ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count)
 
 
 def read_stream(path: Path, kind: Kind) -> Stream:
-    """Return the rows of the file at `path` that can be used.
+    """Return the usable rows of the file at `path`.
 
     Raises:
-        MeasurementError: for a file without times, one that was measured at stops, one whose clock was restarted, and
-            one of which most rows cannot be used.
+        MeasurementError: a file without times, one that was measured at stops, one whose clock was restarted, or one
+            most
+            of whose rows are unusable.
     """
     dropped = Counter[str]()
     jumps = list[_Jump]()
@@ -185,9 +187,10 @@ def read_stream(path: Path, kind: Kind) -> Stream:
 
 
 def _refuse_restart(path: Path, jumps: Sequence[_Jump]) -> None:
-    """Refuse a file whose times go back and do not return: those of a copied block of rows do.
+    """Raise MeasurementError where a file's times go back and do not return (a copied block of rows does return).
 
     Args:
+        path: the file.
         jumps: each jump by more than `RESTART`; the file's end as the last one.
     """
     for jump, following in pairwise(jumps):
@@ -199,7 +202,7 @@ def _refuse_restart(path: Path, jumps: Sequence[_Jump]) -> None:
 
 
 def _piece(table: Table, kind: Kind) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return times (m,) [s] and values (m, k) [SI] of a table, and which rows (m,) can be."""
+    """Return times (m,) [s] and values (m, k) [SI] of a table, and whether each row is possible, (m,) bool."""
     clock = table.index(_clock(table))
     t = table.cells[clock] * table.factor(clock, TIMES, "")
     sound = np.isfinite(t)
@@ -229,7 +232,7 @@ def _clock(table: Table) -> str:
 
 
 def _step(t: np.ndarray, table: Table) -> float:
-    """Return the time between rows [s]; refuse a file that was measured at stops."""
+    """Return the time between rows [s]; raise MeasurementError for a file that was measured at stops."""
     step = float(np.median(np.diff(t)))
     if step > SLOWEST:
         message = f"its rows are {step:.3g} s apart, a stream's {SLOWEST:g} s at most. Is t in ms ('t [ms]')?"
@@ -238,7 +241,9 @@ def _step(t: np.ndarray, table: Table) -> float:
 
 
 def _pieces(path: Path) -> Iterator[Table]:
-    """Yield the table at `path` in pieces of at most `PIECE` rows; what is no number is NaN, and a date its seconds."""
+    """Yield the table at `path` in pieces of at most `PIECE` rows; a cell that is not a number is NaN, a date its
+    seconds.
+    """
     first_row = 1
     with (
         refused_as(MeasurementError, UnicodeDecodeError, "is no UTF-8 text ({}): is the copy complete?", path),
@@ -266,7 +271,7 @@ def _data_lines(lines: Iterable[str]) -> Iterator[str]:
 
 
 def _row(line: str, separator: str, width: int) -> list[float]:
-    """Return the numbers of a line; NaN for all of one that has other than `width` cells."""
+    """Return the numbers of a line; all NaN if it does not have `width` cells."""
     cells = line.split() if separator == " " else line.split(separator)
     if len(cells) != width:
         return [np.nan] * width

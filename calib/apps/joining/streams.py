@@ -63,7 +63,7 @@ WORTH_SAYING = 1.05
 
 @dataclass(frozen=True, eq=False)
 class Streamed(Joined):
-    """Points of a stream with the joints at their times, thinned; the table has the instrument's time, too.
+    """Points of a stream with the joints at their times, thinned; the table also has a column of the instrument's time.
 
     Attributes:
         clock: the instrument's.
@@ -185,7 +185,7 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
 
 
 def _check_motion(recording: Stream, count: int, unit: str) -> None:
-    """Refuse a recording whose first `count` columns hardly change."""
+    """Raise MeasurementError for a recording whose first `count` columns hardly change."""
     travel = float(np.ptp(recording.values[:, :count], axis=0).max())
     if not travel > MIN_MOTION:
         message = f"hardly moves (by {travel:.2g}{unit}), and without motion no clock is found: is the unit right?"
@@ -193,7 +193,7 @@ def _check_motion(recording: Stream, count: int, unit: str) -> None:
 
 
 def _refuse(step: Step | None, wander: float, run: Run, clock: Clock) -> NoReturn:
-    """Refuse recordings in which a clock steps, or wanders."""
+    """Raise MeasurementError for recordings in which a clock steps, or wanders (`step` is None) by `wander` [s]."""
     file = run.stream.file
     if step is None:
         message = f"the clocks' offset leaves a line of offset and drift by {1e3 * wander:.2g} ms"
@@ -206,7 +206,8 @@ def _refuse(step: Step | None, wander: float, run: Run, clock: Clock) -> NoRetur
 
 
 def _usable(cell: Installation, run: Run, clock: Clock) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[Finding]]:
-    """Return usable rows, their residuals (3 or 6, m) and velocities (3, m), and findings; count what is not.
+    """Return the usable rows, their residuals (3 or 6, m) and velocities (3, m), and findings; unusable rows are
+    counted.
 
     Residuals have the variance σ² across the motion, and σ² + v² σ_t² along it.
     """
@@ -236,7 +237,7 @@ def _usable(cell: Installation, run: Run, clock: Clock) -> tuple[np.ndarray, np.
 
 
 def _joints(chain: Chain) -> Kind:
-    """Return how a log's joints are read."""
+    """Return how a log's joint values are read: columns, values, limits."""
     robot = joints_of(chain)
     # limits, and for a joint without any a bound of the right unit
     travel = max_travel(robot.kinds)
@@ -260,7 +261,7 @@ def _joints(chain: Chain) -> Kind:
 
 
 def _target() -> Kind:
-    """Return how an instrument's positions [m], and its quaternions where it has some, are read."""
+    """Return how an instrument's positions [m], and its quaternions where the file has some, are read."""
 
     def names(table: Table) -> tuple[str, ...]:
         sheet = Sheet(table)
@@ -292,7 +293,7 @@ def _target() -> Kind:
 
 
 def _fresh(stream: Stream) -> Stream:
-    """Return the stream without readings that repeat the one before: nothing new was seen."""
+    """Return the stream without readings equal to the one before, in which nothing new was measured."""
     changed = np.diff(stream.values, axis=0).any(axis=1)
     fresh = np.concatenate([[True], changed])
     stream.dropped["repeating the reading before"] = int((~fresh).sum())
@@ -300,9 +301,12 @@ def _fresh(stream: Stream) -> Stream:
 
 
 def _thinned(t: np.ndarray, q: np.ndarray, min_interval: float) -> tuple[np.ndarray, dict[str, float | None]]:
-    """Return the indices of times t (m,) at least `min_interval` [s], between which one of the joints q (m, n) moves.
+    """Return indices of times t (m,) at least `min_interval` [s] apart, with a motion of some joint of q (m, n) between
+    them.
 
-    Second: `apart`, the median time between them [s], and what made it longer: `most` rows, or that a joint `moved`.
+    Also returns the values of a finding: `apart`, the median time between these rows [s]; `most`, the largest number of
+    rows
+    if that limited them; `moved`, the smallest motion of a joint if that did; else None.
     """
     step = float(np.median(np.diff(t)))
     full = float(t[-1] - t[0]) / MAX_ROWS
@@ -334,7 +338,9 @@ def _thinned(t: np.ndarray, q: np.ndarray, min_interval: float) -> tuple[np.ndar
 
 
 def _table(chain: Chain, q: np.ndarray, stream: Stream, rows: np.ndarray, velocity: np.ndarray) -> Table:
-    """Return rows of a stream with their joints q (m, n) and velocities (3, m) as a table of measured poses."""
+    """Return rows of a stream with their joint values q (m, n) and velocities (3, m) [m/s] as a table of measured
+    poses.
+    """
     header, units, cells = ["time"], ["s"], [stream.t[rows]]
     for name, kind, series in zip(chain.joint_names, joint_kinds(chain), q.T):
         factor, unit = JOINT["prismatic" if kind == "prismatic" else "revolute"]

@@ -41,8 +41,8 @@ class DriftFound(ChartedResult, Judged):
     """Drift of the target over a measurement. ``print`` shows verdict, trends and repeated poses.
 
     Attributes:
-        robot: its name.
-        trends: with time and temperatures.
+        robot: name of the robot.
+        trends: trends of the target's position with time and with temperatures.
         noticed: findings, worst first.
     """
 
@@ -60,7 +60,7 @@ class DriftFound(ChartedResult, Judged):
         return Verdict.of("; ".join(totals) or "no column of time or temperature", self.noticed)
 
     def section(self) -> Section:
-        """Return a report section with the trends, and how far repeated poses are apart."""
+        """Return a report section with the trends, and the distances between readings of repeated poses."""
         columns = [
             RecordColumn("with", "{0.what}", number=False),
             RecordColumn("poses", "{0.poses}"),
@@ -76,7 +76,7 @@ class DriftFound(ChartedResult, Judged):
         return Section("Drift", blocks, self.verdict.level, self.verdict.reason)
 
     def charts(self) -> dict[str, Chart]:
-        """Return what the figures show: the motion of repeated poses' targets, with the slope."""
+        """Return the figures by name: the motion of repeated poses' targets, with the slope; empty without trends."""
         from calib.toolkit.report_charts import AFTER, QUIET, Chart, Panel, line
 
         panels = []
@@ -92,7 +92,7 @@ class DriftFound(ChartedResult, Judged):
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write a folder: report.html, trends.csv, metrics.json, and the figure as PNG."""
+        """Write a folder with report.html, trends.csv, metrics.json, and the figure as PNG; return the folder."""
         rows: list[tuple[object, ...]] = []
         for trend in self.trends:
             for x, displacement in zip(trend.x, trend.moved):
@@ -134,14 +134,14 @@ def drift(
     """Return how the target drifts with time and temperature, from poses that were measured more than once.
 
     Args:
-        robot, base, tip: the arm, as of `calib.load`.
+        robot, base, tip: the arm, as for `calib.load`.
         measured: CSV files with some poses measured several times, and columns ``time`` or ``temperature``; all
-            from one place of the instrument.
-        settings: way that matters, and the instrument's σ.
-        options: as of `fit_geometry`.
+            from one station of the instrument.
+        settings: displacement above which drift matters, and the instrument's σ.
+        options: as for `fit_geometry`.
 
     Raises:
-        UsageError: where no pose was measured twice.
+        UsageError: no pose was measured twice.
     """
     if isinstance(options, FitOptions):
         fit_options = options

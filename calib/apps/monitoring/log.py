@@ -51,9 +51,9 @@ class LogLine:
 
     Attributes:
         folder, date, serial, verdict: of the session.
-        errors: rms errors of nominal and calibrated robot on unseen poses [mm]; None without.
-        torque: unexplained on unseen motion [%]; None without.
-        change: of the geometry since the line before; None in the first, and where one of the two has no fit.
+        errors: rms errors of nominal and calibrated robot at held-out poses [mm]; None without such poses.
+        torque: unexplained share of the torque on the held-out motion [%]; None without.
+        change: change of the geometry since the previous line; None in the first, and where one of the two has no fit.
     """
 
     folder: str
@@ -66,7 +66,9 @@ class LogLine:
 
     @property
     def moved(self) -> tuple[float, float] | None:
-        """How far the tool moved since the line before, rms, and what σ lets expect [mm]."""
+        """Rms motion of the tool since the previous line, and the motion expected from the covariances [mm]; None
+        without change.
+        """
         if self.change is None:
             return None
         motion = self.change.motions[0]
@@ -74,7 +76,7 @@ class LogLine:
 
     @property
     def first(self) -> ParameterChange | None:
-        """The parameter that explains most of the change, where something changed."""
+        """The parameter that explains most of the change; None where nothing changed."""
         if self.change is None or not self.change.changed:
             return None
         return self.change.parameters[0]
@@ -88,7 +90,7 @@ class LogLine:
         return f"{change.name} {plus_minus(change.alone, change.alone_sigma, change.unit)}"
 
     def row(self, robot: str) -> tuple[object, ...]:
-        """Return the cells of `HEADER`."""
+        """Return the cells of the log's table, in the order of `HEADER`."""
         nominal, calibrated = self.errors or (None, None)
         motion, sigma = self.moved or (None, None)
         change: tuple[object, ...] = ("", None, None, "")
@@ -124,7 +126,7 @@ class RobotLog(ChartedResult, Judged, Unjudged):
         return Section("Log", [table(f"Calibrations of {self.robot}", columns, self.lines)])
 
     def charts(self) -> dict[str, Chart]:
-        """Return what the figure shows: errors of each calibration, and the tool's motion since the one before."""
+        """Return the figure by name: errors of each calibration, and the tool's motion since the previous one."""
         from calib.toolkit.report_charts import AFTER, BEFORE, Chart, Panel, line
 
         errors = []
@@ -149,7 +151,7 @@ class RobotLog(ChartedResult, Judged, Unjudged):
         return {"log": Chart(panels, 2.6, 2)}
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write a folder: report.html, log.csv, metrics.json, and the figure as PNG."""
+        """Write a folder with report.html, log.csv, metrics.json, and the figure as PNG; return the folder."""
         charts: dict[str, Chart] = {}
         if plots:
             charts = self.charts()
@@ -190,13 +192,13 @@ def log(folders: Sequence[str | Path], *, mixed: bool = False) -> RobotLog:
     """Return the log of one robot's calibrations.
 
     Args:
-        folders: of finished sessions, or their ``session.toml``.
-        mixed: accept sessions of other names or serial numbers.
+        folders: folders of finished sessions, or their ``session.toml``.
+        mixed: accept sessions of different names or serial numbers.
 
     Raises:
-        UsageError: where sessions are of robots of other names or serial numbers.
-        RobotError: where their nominal geometries differ.
-        SessionError: for a session that has not come to a verdict.
+        UsageError: the sessions state different robots or serial numbers, without `mixed`.
+        RobotError: their nominal geometries differ.
+        SessionError: a session has no verdict yet.
     """
     sessions = [open_result(path, "session").require_session() for path in folders_of(folders)]
     sessions.sort(key=_created)
@@ -229,7 +231,7 @@ def log(folders: Sequence[str | Path], *, mixed: bool = False) -> RobotLog:
 
 
 def _check_same(attribute: str, names: Sequence[str], mixed: bool) -> None:
-    """Refuse sessions that state several names, unless they are to be mixed; sessions without one go with all."""
+    """Raise UsageError for sessions that state several names, unless `mixed`; a session that states none is accepted."""
     different = list(dict.fromkeys(name for name in names if name))
     message = f"the sessions have different {attribute} ({', '.join(different)}); --mixed takes them for one robot"
     require(len(different) < 2 or mixed, message, UsageError)

@@ -35,7 +35,7 @@ def save(
     numbers: object,
     tables: Sequence[str],
 ) -> Path:
-    """Write the folder `out` and return its path; `tables`: names of all that this `kind` of result may write.
+    """Write the folder `out` and return its path; `tables`: names of all tables that this `kind` of result may write.
 
     Raises:
         UsageError: for a folder that holds something else.

@@ -1,7 +1,7 @@
 """Placements of tool, base, camera and board in Python: `calib.tool`, `calib.base`, `calib.hand_eye`.
 
-All three are the fit of model ``frames`` (`calib.fit_geometry`), which places the instrument and what it sees, and
-leaves the arm as it is; they differ in the frames that are shown.
+All three are the fit of model ``frames`` (`calib.fit_geometry`), which places the instrument and its targets, and does
+not change the arm; they differ in the frames that are shown.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ class Placed(NamedTuple):
     """A placed frame.
 
     Attributes:
-        name: of it, and of what it is placed in.
-        pose: (4, 4) [m].
-        sigma: (6,) of its position [m] and of turns about the axes [rad], both along the axes of the frame that it
-            is placed in; NaN where the measurements do not identify it.
+        name: names of the frame and of its reference frame.
+        pose: (4, 4) in the reference frame [m].
+        sigma: (6,) σ of its position [m] and of turns about the axes [rad], along the axes of the reference frame; NaN
+            where
+            the measurements do not identify it.
     """
 
     name: str
@@ -88,7 +89,7 @@ class Placements(GeometryFit):
         return tuple(frames)
 
     def lines(self, *first: str) -> Iterator[str]:
-        """Yield what a command prints: the frames whose names begin with one of `first`, and the verdict."""
+        """Yield what a command prints: the verdict, and the frames whose names begin with one of `first`."""
         poses = self.fit.poses
         yield str(self.verdict)
         for frame in self.placed:
@@ -105,12 +106,16 @@ class Placements(GeometryFit):
 
 
 def _turned(pose: np.ndarray) -> np.ndarray:
-    """Return the Jacobian (6, 6) of the fit's small motions, which are along a frame's own axes."""
+    """Return the Jacobian (6, 6) from the fit's small motions, along the frame's own axes, to those along its reference
+    axes.
+    """
     return np.kron(np.eye(2), pose[:3, :3])
 
 
 def _sigma(estimate: Estimate, name: str, jacobian: np.ndarray) -> np.ndarray:
-    """Return the standard deviations (6,) of J times the six small motions of a frame; NaN where not identified."""
+    """Return the standard deviations (6,) of `jacobian` times the six small motions of a frame; NaN where not
+    identified.
+    """
     identified = np.zeros(6, dtype=bool)
     index = []
     for k, axis in enumerate(FRAME_AXES):
@@ -152,10 +157,10 @@ def tool(
     """Calibrate the tool (TCP): the target's placement in the arm's tip, from a dozen measured poses.
 
     Args:
-        robot, base, tip: the arm, as of `calib.load`; its geometry is left as it is.
-        measured: CSV files, folders of images, or what `read_poses` returned, as of `fit_geometry`.
+        robot, base, tip: the arm, as for `calib.load`; its geometry is not changed.
+        measured: CSV files, folders of images, or the result of `read_poses`, as for `fit_geometry`.
         settings: tolerance, share held out.
-        options, progress: as of `fit_geometry`.
+        options, progress: as for `fit_geometry`.
 
     Returns:
         The fit: ``placed`` has the frames with σ, ``verdict`` the verdict.
@@ -170,6 +175,8 @@ def base(
 ) -> Placements:
     """Calibrate the base: the arm's placement in the instrument's frame, from a dozen measured poses.
 
+    The fit is that of `tool`, with its arguments (robot, measured, settings, and further ones by their names).
+
     It is the fit of `tool`, with the same arguments (robot, measured, settings, and more by their names).
     """
     return tool(robot, measured, settings, **arguments)
@@ -178,7 +185,9 @@ def base(
 def hand_eye(
     robot: Arm, measured: Several, settings: PlacementSettings = DEFAULT_PLACEMENT, **arguments: Any
 ) -> Placements:
-    """Calibrate camera and board, one carried by the arm and the other beside it, from a dozen images.
+    """Calibrate camera and board, one carried by the arm and the other fixed beside it, from a dozen images.
+
+    The fit is that of `tool`, with its arguments (robot, measured, settings, and further ones by their names).
 
     It is the fit of `tool`, with the same arguments (robot, measured, settings, and more by their names).
     """

@@ -47,7 +47,7 @@ SANDBOX = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; sandbox
 
 
 class Guard:
-    """Refuses requests without the token, for another host's name (DNS rebinding), and posts of other sites' pages."""
+    """Refuses requests without token, with another host's name (DNS rebinding), and posts from other sites' pages."""
 
     def __init__(self, app: ASGIApp, token: str, host: str) -> None:
         self.app = app
@@ -63,7 +63,7 @@ class Guard:
         await responder(scope, receive, send)
 
     def _answer(self, request: Request) -> Response | None:
-        """Return what is said in place of a page; None for a request that may pass."""
+        """Return the answer given instead of a page; None for a request that may pass."""
         requested_host = request.headers.get("host", "")
         if not self._is_ours(requested_host):
             return PlainTextResponse("This page is not served under that name: use the address printed.", 403)
@@ -103,9 +103,9 @@ def application(work: Work, token: str = "", host: str = "127.0.0.1") -> Starlet
     """Return the web application of a session.
 
     Args:
-        work: its worker.
-        token: that every request has to know; empty: none.
-        host: by which it is reached, besides addresses in numbers and this computer's names.
+        work: the session's worker.
+        token: token required in every request; empty: none.
+        host: host name accepted besides numeric addresses and this computer's names.
     """
     clear_staging(open_session(work.folder))
     routes = [
@@ -138,7 +138,7 @@ def refused(request: Request, error: Exception) -> Response:
 
 
 def page(request: Request) -> Response:
-    """Return the page of the session as it stands."""
+    """Return the page with the session's present state."""
     work: Work = request.app.state.work
     session = open_session(work.folder)
     states = step_states(session)
@@ -185,7 +185,7 @@ def _notes(session: Session) -> dict[str, tuple[str, ...]]:
 
 
 def _kinds(session: Session) -> list[tuple[str, str, list[str]]]:
-    """Return the kinds of files that the session takes: name, words, and those that were brought."""
+    """Return the kinds of files that the session takes: name, description, and the files that were brought."""
     labels = dict(step.brings for step in steps_of(session))
     if session.geometric:
         labels["drift"] = DRIFT
@@ -213,7 +213,7 @@ def _files(session: Session) -> list[Path]:
 
 
 def script(request: Request) -> Response:
-    """Return the page's script, which does nothing that the page could not do without it."""
+    """Return the page's script; the page works without it."""
     return FileResponse(Path(__file__).with_name("page.js"))
 
 
@@ -231,7 +231,7 @@ def file(request: Request) -> Response:
 
 
 def view(request: Request) -> Response:
-    """Lead to the 3-D view of the session's recording; at this computer only, where Rerun's server listens."""
+    """Redirect to the 3-D view of the session's recording; only on this computer, where Rerun's server listens."""
     recording = open_session(request.app.state.work.folder).path(RECORDING)
     if not recording.exists():
         return PlainTextResponse("no recording yet", 404)
@@ -241,7 +241,7 @@ def view(request: Request) -> Response:
 
 
 def go_on(request: Request) -> Response:
-    """Start a run of `calib next`, or `calib redo`; where one is under way already, none."""
+    """Start a run of `calib next`, or of `calib redo` if path names a step; no second one while a run is under way."""
     work = request.app.state.work
     step = request.path_params.get("step", "")
     task = NEXT
@@ -268,7 +268,7 @@ async def bring(request: Request) -> Response:
 
 
 def set_aside(request: Request) -> Response:
-    """Move what was brought into the folder ``aside`` beside it, where the session does not read it."""
+    """Move a file that was brought into the folder ``aside`` beside it, where the session does not read it."""
     work = request.app.state.work
     name = request.path_params["name"]
     session = open_session(work.folder)

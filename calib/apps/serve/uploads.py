@@ -1,4 +1,4 @@
-"""Files brought over the network: streamed to the session's folder, under names that it knows, whole or not at all."""
+"""Files brought over the network: streamed to the session's folder under names that it reads, whole or not at all."""
 
 import os
 import tempfile
@@ -19,10 +19,10 @@ BAG = "metadata.yaml"
 
 
 def targets(session: Session, kind: str, names: list[str]) -> list[Path]:
-    """Return where files of a kind (`BROUGHT`) belong, by the names that they have on the sender's side.
+    """Return the paths at which files of a kind (a key of `BROUGHT`) are stored, by the sender's file names.
 
     Raises:
-        UsageError: for names by which the session would take them for something else, or nothing.
+        UsageError: names that are empty or equal, or that the session would not read as files of this kind.
     """
     folder, prefix = BROUGHT[kind]
     plain = []

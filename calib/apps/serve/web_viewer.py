@@ -1,4 +1,4 @@
-"""The 3-D view of a session's recording: Rerun's web viewer, which this computer's browsers alone reach."""
+"""The 3-D view of a session's recording: Rerun's web viewer, which only browsers on this computer can reach."""
 
 import os
 import signal
@@ -20,7 +20,7 @@ START_TIME = 20.0
 
 
 class WebViewer:
-    """A viewer's process, begun at the first question and anew for a new recording."""
+    """The viewer's process, started at the first request and anew for a new recording."""
 
     def __init__(self) -> None:
         self.process: subprocess.Popen[bytes] | None = None
@@ -32,7 +32,7 @@ class WebViewer:
         """Return the address at which the viewer shows a recording.
 
         Raises:
-            CalibError: where Rerun does not start.
+            CalibError: Rerun does not start.
         """
         version = recording, recording.stat().st_mtime_ns
         if self.process is None or self.process.poll() is not None or self.version != version:

@@ -1,4 +1,6 @@
-"""The one worker of a served session: a process per run of `calib next` or check of files, one at a time.
+"""The worker of a served session: one process per run of `calib next` or check of files, one at a time.
+
+Messages of a run are kept here, so that every page, reloaded or in another tab, shows the same progress.
 
 What a run says is kept here, so that every page, reloaded or in another tab, shows the same progress.
 """
@@ -29,14 +31,15 @@ _spawned = get_context("spawn")
 
 @dataclass
 class Job:
-    """A run or a check, and what it has said so far.
+    """A run or a check, and its messages so far.
 
     Attributes:
         task: `CHECK`, `NEXT` or `REDO`.
         subject: the kind of files to check, or the step to repeat.
-        lines, words: said to stay, and the last that passes.
-        problem: why it failed.
-        began: by `time.monotonic` [s].
+        lines: permanent messages.
+        words: the last transient message.
+        problem: why it failed; empty otherwise.
+        began: time at which it began, by `time.monotonic` [s].
     """
 
     task: str
@@ -48,16 +51,16 @@ class Job:
 
     @property
     def seconds(self) -> int:
-        """Since it began [s]."""
+        """Seconds since the job began, rounded."""
         return round(time.monotonic() - self.began)
 
 
 class Work:
-    """Runs jobs on a session's folder one after the other, each in a process of its own.
+    """Runs jobs on a session's folder one after the other, each in a separate process.
 
     Attributes:
         current: the running job, or None.
-        last: the last run.
+        last: the last run, or None.
         checks: the last check of each kind of files.
     """
 
@@ -71,7 +74,7 @@ class Work:
         self._process: Any = None
 
     def ask(self, task: str, subject: str = "") -> bool:
-        """Queue a job and return True; return False where a run is under way, or this check is queued."""
+        """Queue a job and return True; return False where a run is under way, or this job is queued already."""
         with self._lock:
             jobs = list(self._waiting)
             if self.current and task != CHECK:
@@ -125,7 +128,7 @@ class Work:
 
 
 def _run(sender: Connection, folder: Path, task: str, subject: str) -> None:
-    """Do a job in its own process, and send what there is to say."""
+    """Run a job in this (separate) process, and send its messages."""
     from calib.toolkit.sessions import go_on
 
     def send(kind: str, text: object) -> None:
@@ -153,10 +156,10 @@ def _run(sender: Connection, folder: Path, task: str, subject: str) -> None:
 
 
 def checked(session: Session, kind: str) -> list[str]:
-    """Check the files that were brought of a kind as the session's step does, and return its notes.
+    """Check the brought files of a kind as the session's step does, and return notes.
 
     Raises:
-        CalibError: for what the step would refuse.
+        CalibError: files that the step would refuse.
     """
     from calib.toolkit.sessions import chain_of, check_recording, notes_on, read_measured
 

@@ -118,18 +118,18 @@ class Condition:
     """One experiment, without the seed of its noise.
 
     Attributes:
-        name: what people call it; no part of what it is.
+        name: name in tables; not part of the key.
         robot: one of `ROBOTS`.
-        sigma_q, sigma_tau: [rad] in the loop, [N m] of the log.
+        sigma_q, sigma_tau: σ of the encoders in the loop [rad], and of the logged torque [N m].
         decimation: factor of the parallel decimation.
-        cutoff: of the positions' filter [Hz]; 0 for none.
-        mismatch: what is believed wrongly, one of `MISMATCHES`.
-        duration: [s].
-        guess: relative error of the parameters that methods start from which ask for some.
-        resimulated: data sets below it get the survey's position error.
+        cutoff: cut-off frequency of the positions' filter [Hz]; 0 for none.
+        mismatch: what the methods assume wrongly, one of `MISMATCHES`.
+        duration: duration of the motion [s].
+        guess: relative error of the start parameters, for methods that need some.
+        resimulated: number of data sets for which the survey's position error is computed.
         motion: one of `MOTIONS`, or the folder of a `calib excite`.
-        rate: of the log [Hz]; 0 for the robot's own.
-        guesses: start values of each data set; trial k is of data set k // guesses and guess k % guesses.
+        rate: sampling rate of the log [Hz]; 0 for the robot's own.
+        guesses: start values per data set; trial k uses data set k // guesses and guess k % guesses.
     """
 
     name: str
@@ -163,10 +163,10 @@ class Study:
     """Conditions of a study, and the number of runs of each method on each condition.
 
     Attributes:
-        name, about: of the study.
-        conditions: all with names of their own.
-        runs: name of a method → number of data sets, for each condition (in their order).
-        seeds: number of the first data set, by condition.
+        name, about: name and description of the study.
+        conditions: the conditions, with distinct names.
+        runs: for each condition in this order, name of a method to number of data sets.
+        seeds: for each condition, number of the first data set.
     """
 
     name: str
@@ -191,11 +191,11 @@ def read_study(files: Sequence[str | Path], methods: Sequence[str] | None = None
     """Return the study of one or several files.
 
     Args:
-        files: paths, names of shipped ones, or patterns of these (``MCS-*``).
-        methods, runs: in place of the files'.
+        files: paths, names of shipped studies, or patterns of these (``MCS-*``).
+        methods, runs: replace those of the files; None: as in the files.
 
     Raises:
-        UsageError: for a file that cannot be one, a method's name misspelt, two conditions of one name.
+        UsageError: an invalid study file, an unknown method, or two conditions of one name.
     """
     for name in methods or ():
         method_named(name)
@@ -225,11 +225,7 @@ def read_study(files: Sequence[str | Path], methods: Sequence[str] | None = None
 
 
 def _check_cutoffs(conditions: Sequence[Condition]) -> None:
-    """Refuse cutoff frequencies at or above half the logging rate.
-
-    Raises:
-        UsageError: for a cut-off that the robot's log is sampled too slowly for.
-    """
+    """Raise UsageError for cut-off frequencies at or above half the sampling rate of the log."""
     from calib.toolkit.simulations import known_truth  # slow to load
 
     for condition in conditions:
@@ -262,7 +258,7 @@ def _parse(path: Path) -> StudyFile:
     """Return the study of a file.
 
     Raises:
-        UsageError: see `calib.config.parse`; methods that there are none of.
+        UsageError: see `calib.config.parse`; an unknown method.
     """
     study = parse(StudyFile, read_toml(path), str(path))
     for name in study.methods:
@@ -318,7 +314,7 @@ def _cutoff_name(cutoff: float) -> str:
 
 
 def _counts(study: StudyFile, methods: Sequence[str] | None, runs: int | None) -> dict[str, int]:
-    """Return the number of runs of each method; `methods` and `runs` in place of the file's."""
+    """Return the number of runs of each method; `methods` and `runs` replace those of the file, None keeps them."""
     if "all" in study.methods:
         names = list(METHODS)
     else:

@@ -85,11 +85,11 @@ class Setup:
     """Data shared by all data sets of a condition.
 
     Attributes:
-        chain: the arm as it is believed to be.
+        chain: the arm that the methods assume.
         plant: the robot as its maker describes it.
-        reference: the motion, at the control rate.
-        validation: the motion that validates.
-        every: control periods per sample, whole or not.
+        reference: the training motion, at the control rate.
+        validation: the motion on which estimates are judged.
+        every: control periods per sample; need not be whole.
     """
 
     chain: Chain
@@ -104,10 +104,12 @@ class Experiment:
     """One simulated data set.
 
     Attributes:
-        problem: what a method is given; model: of it.
+        problem: input of a method.
+        model: its identification model.
         truth: (b,) true values of the model's base parameters.
-        matrix: (K, n, b) base regressor of the believed robot along the validation motion.
-        torque: (K, n) noise-free torques that the true robot needs along it, without what it carried unknown [N m].
+        matrix: (K, n, b) base regressor of the assumed robot along the validation motion.
+        torque: (K, n) noise-free torques of the true robot along the validation motion, without its unknown payload [N
+            m].
     """
 
     problem: IdentificationProblem
@@ -163,7 +165,7 @@ def _best_random_motion(robot: str, chain: Chain, duration: float, rate: float) 
 
 
 def _drawn(chain: Chain, duration: float, rate: float, number: int) -> Reference:
-    """Return a random Fourier series within the limits, always the same for a number."""
+    """Return the random Fourier series number `number` within the limits; reproducible."""
     lower, upper = chain.sampling_limits()
     middle, half = 0.5 * (lower + upper), 0.5 * REACH * (upper - lower)
     speed = SPEED * np.array([joint.velocity for joint in chain.joints])
@@ -186,10 +188,10 @@ def _nominal_base(robot: str) -> Base:
 
 @lru_cache(maxsize=2)
 def make_experiment(condition: Condition, seed: int) -> Experiment:
-    """Return the simulated data set of a condition and a trial's seed, with its start values; always the same.
+    """Return the simulated data set of a condition and a trial's seed, with its start values; reproducible.
 
     Raises:
-        CalibError: where the true robot cannot be recorded.
+        CalibError: the true robot cannot be simulated in its loop.
     """
     number, guess = divmod(seed, condition.guesses)
     data = data_set(condition, number)
@@ -206,7 +208,7 @@ def make_experiment(condition: Condition, seed: int) -> Experiment:
 
 @lru_cache(maxsize=2)
 def data_set(condition: Condition, seed: int) -> Experiment:
-    """Return the simulated data set of a condition and a seed, without start values; always the same."""
+    """Return the simulated data set of a condition and a seed, without start values; reproducible."""
     setup = set_up(condition)
     controller = published_controller(condition.robot)
     robots = _robots(condition, setup, seed)
@@ -246,9 +248,9 @@ class _Robots:
     """The robots of a data set.
 
     Attributes:
-        true: that is recorded.
-        model, base: assumed model with its base parameters.
-        truth: robot with the true values of the model's parameters.
+        true: the robot that is recorded.
+        model, base: the assumed model with its base parameters.
+        truth: a robot with the true values of the model's parameters.
     """
 
     true: Plant
@@ -258,7 +260,7 @@ class _Robots:
 
 
 def _robots(condition: Condition, setup: Setup, seed: int) -> _Robots:
-    """Return the true robot, the assumed model with its base, and the robot with the model's parameters."""
+    """Return the robots of a data set, with the mismatch of the condition."""
     plant = setup.plant
     chain = setup.chain
     robots = _Robots(plant, plant_model(plant), _nominal_base(condition.robot), plant)
@@ -328,7 +330,9 @@ def _loop(condition: Condition, controller: LoopController) -> LoopSettings:
 def _guess(plant: Plant, spread: float, seed: int) -> np.ndarray:
     """Return the robot's parameters with normal relative errors; the inertias stay physically consistent.
 
-    A body is drawn until it can be (the survey's way, but body by body); where that takes long, from a smaller spread.
+    Errors of a body are drawn until it is physically consistent (as in the survey, but body by body); where that takes
+    too
+    many draws, the spread is halved.
     """
     rng = np.random.default_rng([seed, 15])
     size = plant.inertial

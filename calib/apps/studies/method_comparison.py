@@ -50,19 +50,22 @@ class ComparedMethod:
     """Result of one method.
 
     Attributes:
-        name: of it.
-        failure: why there is no estimate; "" where there is one.
-        rank: by the error on unseen motion, from 1; 0 without an estimate.
-        unseen, sigma: error on unseen motion in the band, and its standard error [%].
-        raw: the same against the torque as recorded [%].
-        training: in the band, of the training data [%].
-        worst: joint with the largest error on unseen motion, counted from 1, and that [%].
-        behind, behind_sigma: difference from the best, and its standard error [%].
-        good, chosen: whether it is as good as the best, and the one to take.
-        parameters: number of them.
-        seconds: of the method alone.
-        iterations, simulations: of the method.
-        verdict, warnings: what `calib identify` says of it; None and empty but for the one that the rule comes to.
+        name: name of the method.
+        failure: why there is no estimate; empty where there is one.
+        rank: rank by the error on the held-out motion, from 1; 0 without an estimate.
+        unseen, sigma: error on the held-out motion in the identification band, and its standard error [%].
+        raw: error on the held-out motion against the torque as recorded [%].
+        training: error on the training data in the band [%].
+        worst: joint with the largest error on the held-out motion, counted from 1, and that error [%].
+        behind, behind_sigma: difference of `unseen` from the best method, and its standard error [%].
+        good: whether the method is as good as the best.
+        chosen: whether it is the recommended method.
+        parameters: number of its parameters.
+        seconds: time of the method alone [s].
+        iterations, simulations: number of iterations and simulations of the method.
+        verdict, warnings: verdict and warnings of `calib identify` on its model, for the method that the rule selects
+        only;
+            else None and empty.
     """
 
     name: str
@@ -106,7 +109,7 @@ def compare_methods(
     say: Callable[[str], None] = _ignore,
     done: Callable[[ComparedMethod], None] = _ignore,
 ) -> list[ComparedMethod]:
-    """Return the results of all methods on the recordings, best first; failed methods come last.
+    """Return the results of all methods on the recordings, best first; methods without an estimate come last.
 
     Args:
         inputs: training recordings, and unseen ones.

@@ -340,10 +340,10 @@ class StudyOutcome:
 
     Attributes:
         conditions: summary of each condition.
-        progress: of this command.
-        notes: what a user should know.
-        folder: of rows, summary and report.
-        rows: which file holds how many rows, in words; "" where nothing was run.
+        progress: progress of this command.
+        notes: notes for the user.
+        folder: folder of rows, summary and report.
+        rows: sentence on the number of rows in the file; empty where nothing was run.
     """
 
     conditions: tuple[ConditionSummary, ...]
@@ -382,16 +382,16 @@ def run_study(
 
     Args:
         studies: study files, names of shipped ones, patterns of these.
-        out: the folder of its rows; those that are there count.
-        methods, runs: in place of the files'.
-        where: the tasks run, see `calib.workers.workers`.
-        report_only: run nothing, and leave the rows as they are, also while another command adds to them.
+        out: the folder of its rows; trials whose rows it has are not run again.
+        methods, runs: replace those of the files; None: as in the files.
+        where: where the tasks run, see `calib.workers.workers`.
+        report_only: run nothing and leave the rows as they are, also while another command adds rows.
         plots: whether the report has figures.
         say: called with messages on progress.
 
     Raises:
-        UsageError: for a file that is no study, a folder that another command works in, rows of another version.
-        CalibError: where rows cannot be kept, or the workers are gone; what is kept is kept.
+        UsageError: an invalid study file, a folder in use by another command, or rows of another version.
+        CalibError: rows cannot be written, or the workers are lost; rows written before remain.
     """
     study = read_study(studies, methods, runs)
     _check_folder(out, studies)
@@ -446,7 +446,7 @@ def _counted(study: Study, rows: Sequence[TrialRow]) -> tuple[list[TrialRow], li
 
 
 def _check_folder(out: Path, studies: Sequence[str | Path]) -> None:
-    """Raise if the output folder is a file, or contains files of these names that no study has written."""
+    """Raise UsageError if the output folder is a file, or contains files of these names that no study has written."""
     require(not out.is_file(), f"{out} is a file; give a folder for the study's rows (--out)", UsageError)
     files.check_not_input([out, *(out / name for name in OURS)], studies)
     check_format(out)

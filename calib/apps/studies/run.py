@@ -23,13 +23,14 @@ class Progress:
     """Progress of a study's command.
 
     Attributes:
-        total: trials that this command has to run.
-        done, failed: that have ended; of these without an estimate.
-        lost: that no worker brought back.
-        spent: seconds of each trial that has ended, by method.
+        total: number of trials that this command has to run.
+        done: number of trials that have ended.
+        failed: number of these without an estimate.
+        lost: number of trials that no worker returned.
+        spent: durations [s] of the trials that have ended, by method.
         remaining_trials: number of trials that have not ended, by method.
-        seconds: since it began.
-        pace: of each worker.
+        pace: throughput of each worker.
+        began: time at which the command began, by `time.monotonic` [s].
     """
 
     total: int
@@ -103,13 +104,16 @@ def _missing(study: Study, store: RowStore) -> Iterator[Trials]:
 
 
 def run(study: Study, store: RowStore, workers: Workers, say: Callable[[Progress], None]) -> Progress:
-    """Run the missing trials of a study; each row is stored as soon as it arrives.
+    """Run the missing trials of a study and return the progress; each row is stored as soon as it arrives.
 
     Args:
-        say: called with how far it is, now and then.
+        study: the study.
+        store: the store of its rows.
+        workers: workers that run the tasks.
+        say: called with the progress at intervals.
 
     Raises:
-        CalibError: where rows cannot be kept, or the workers are gone.
+        CalibError: rows cannot be written, or the workers are lost.
     """
     tasks = list(_missing(study, store))
     progress = Progress(sum(len(task.methods) for task in tasks))

@@ -45,8 +45,8 @@ class RowStore:
     """Rows of a study's folder, locked for one process; made by `opened`.
 
     Attributes:
-        folder: of the study.
-        rows: key → row.
+        folder: folder of the study.
+        rows: key to row.
     """
 
     def __init__(self, folder: Path, database: sqlite3.Connection) -> None:
@@ -64,7 +64,7 @@ class RowStore:
         """Append rows and write them to the disk before returning.
 
         Raises:
-            CalibError: where the disk is full; rows of before are kept, none of these.
+            CalibError: the disk is full; earlier rows are kept, none of these is.
         """
         fresh = [row for row in rows if not self.holds(row.key)]
         advice = f"{len(self.rows)} rows are kept: free disk space, then run the same command again"
@@ -80,8 +80,8 @@ def opened(folder: Path) -> Iterator[RowStore]:
     """Yield the store of a folder, locked for one command until the process ends.
 
     Raises:
-        UsageError: while another command works on it; for a store of another version, or a damaged one.
-        CalibError: for a folder that cannot be written.
+        UsageError: another command works on it, or the store is of another version or damaged.
+        CalibError: the folder cannot be written.
     """
     check_format(folder)
     files.check_writable(folder)
@@ -92,10 +92,10 @@ def opened(folder: Path) -> Iterator[RowStore]:
 
 
 def read_rows(folder: Path) -> list[TrialRow]:
-    """Return all rows of a folder, even while another command writes to it.
+    """Return all rows of a folder, even while another command writes to it; empty without a store.
 
     Raises:
-        UsageError: for a store of another version, or a damaged one.
+        UsageError: a store of another version, or a damaged one.
     """
     check_format(folder)
     if not (folder / ROWS).exists():
@@ -108,10 +108,10 @@ def read_rows(folder: Path) -> list[TrialRow]:
 
 
 def check_format(folder: Path) -> None:
-    """Raise if the folder contains rows of format 1 only, which this version does not read.
+    """Check that a folder does not contain rows of format 1 only, which this version does not read.
 
     Raises:
-        UsageError: says what to do.
+        UsageError: it does; the message advises what to do.
     """
     if (folder / ROWS).exists():
         return

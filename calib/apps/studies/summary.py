@@ -1,13 +1,18 @@
 """Summaries of trials: figures of merit of each method on each condition, and which methods differ significantly.
 
 Failures count: a trial without an estimate has an infinite error, in medians and in comparisons. Methods are compared
-on the same data sets, pair by pair, by the sign test (Conover 1999, section 3.4), since errors of two methods on one
-data set go together and their distributions have long tails; of several guesses the first one is compared.
+in pairs, on equal data sets, by the sign test (Conover 1999, section 3.4), since the errors of two methods on one data
+set are correlated and their distributions have long tails; of several guesses the first one is compared.
 
-The rule: of the methods that give an estimate in at least `RELIABLE` of the trials, those whose torque error on unseen
-motion cannot be distinguished from the best one's (`LEVEL`), or larger by no more than `SLACK` in the median data set,
-are as good as the best; a method of fewer than `MIN_DATA_SETS` runs is listed and takes no part. Of these one is
-taken that is cheap: no more than `ALIKE` times the processor time of the cheapest, and of such the first in rank.
+The rule: among the methods that give an estimate in at least `RELIABLE` of the trials, a method is as good as the best
+if
+its torque error on held-out motion cannot be distinguished from that of the best (`LEVEL`), or is larger by no more
+than
+`SLACK` in the median data set; a method of fewer than `MIN_DATA_SETS` runs is listed but not compared. Of the methods
+as
+good as the best, those that need no more than `ALIKE` times the processor time of the cheapest count as cheap; the
+first
+of these in rank is recommended.
 """
 
 import math
@@ -62,13 +67,15 @@ class MethodSummary:
     """Summary of one method on one condition.
 
     Attributes:
-        trials: number of its rows; failures: status → how many of them gave no estimate.
-        examples: status → data set and message of the first of these.
-        figures: name of a figure (`FIGURES`) → its spread.
-        rank: by the median torque error, from 1.
-        as_good: not distinguishable from the best, or within `SLACK` of it, and reliable.
-        chosen: the one of those to take.
-        p: of the sign test against the best; NaN for the best itself.
+        method: name of the method.
+        trials: number of its rows.
+        failures: status to number of trials that ended with it and gave no estimate.
+        examples: status to data set and message of the first such trial.
+        figures: name of a figure (`FIGURES`) to its median and quartiles.
+        rank: rank by the median torque error, from 1.
+        as_good: reliable, and not distinguishable from the best or within `SLACK` of it.
+        chosen: whether the method is the recommended one.
+        p: p value of the sign test against the best; NaN for the best itself.
     """
 
     method: str
@@ -88,7 +95,7 @@ class MethodSummary:
 
     @property
     def estimates(self) -> bool:
-        """Whether the median torque error is finite, so not a failure."""
+        """Whether the median torque error is finite: at least half of the trials gave an estimate."""
         return bool(np.isfinite(self.figures["torque_error"].median))
 
     @property
@@ -121,7 +128,7 @@ class ConditionSummary:
 
     @property
     def why_none(self) -> str:
-        """Reason why no method is recommended; "" if one is, or without rows."""
+        """Reason why no method is recommended; empty if one is, or without rows."""
         if self.chosen or not self.methods:
             return ""
         if not any(method.enough for method in self.methods):
@@ -132,9 +139,9 @@ class ConditionSummary:
 def summarise(study: Study, rows: Iterable[TrialRow]) -> list[ConditionSummary]:
     """Return the summary of each condition of a study, over all methods that have rows.
 
-    Rows of other conditions do not count, nor do those of a method that has changed since.
-
-    Methods that the study no longer asks for stay in the summary while their rows are stored.
+    Rows of other conditions do not count, nor rows of an earlier version of a method. Methods that the study no longer
+    asks
+    for stay in the summary while their rows are stored.
     """
     by_digest: dict[str, dict[str, list[TrialRow]]] = {}
     for row in rows:
@@ -195,7 +202,7 @@ def _ranked(condition: Condition, rows: Mapping[str, Sequence[TrialRow]]) -> Con
 
 
 def _pairs(errors: Mapping[int, float], reference: Mapping[int, float]) -> list[tuple[float, float]]:
-    """Return the errors of two methods on the data sets of both."""
+    """Return the errors of two methods on the data sets that both have."""
     return [(errors[seed], reference[seed]) for seed in errors.keys() & reference.keys()]
 
 
@@ -244,10 +251,10 @@ def sign_test(errors: Mapping[int, float], reference: Mapping[int, float]) -> fl
     """Return the two-sided p value of the sign test between the errors of two methods.
 
     Args:
-        errors, reference: seed → error; seeds in both count, ties do not.
+        errors, reference: seed to error; only seeds in both are compared, ties are left out.
 
     Returns:
-        1 where fewer than `MIN_DATA_SETS` data sets distinguish them.
+        The p value; 1 where fewer than `MIN_DATA_SETS` data sets distinguish the methods.
     """
     larger = smaller = 0
     for error, reference_error in _pairs(errors, reference):

@@ -118,7 +118,7 @@ def run_trials(trials: Trials) -> list[TrialRow]:
 
 
 def run_trial(condition: Condition, method: str, seed: int) -> TrialRow:
-    """Return the row of a condition, a method and a seed; always the same, except for the times."""
+    """Return the row of a condition, a method and a seed; reproducible except for the times."""
     head: FieldValues = {
         "condition": condition.name,
         "digest": condition.digest,

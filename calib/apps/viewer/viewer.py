@@ -1,4 +1,7 @@
-"""Display of a scene in Rerun; the only module that loads rerun-sdk, and only to show a scene.
+"""Display of a scene in Rerun; the only module that loads rerun-sdk, and only when a scene is shown.
+
+Everything is on one timeline, ``time`` [s], in the order of the work: pose plans as they grow, measured poses one by
+one, motions, torques. A pose lasts `EACH`, a motion its own duration. Poses also have timelines of their own.
 
 Everything plays on one clock, the timeline ``time``, in the order of the work: pose plans as they grow, measured poses
 one by one, motions, torques; poses last `EACH`, motions as long as they are. Poses have timelines of their own beside.
@@ -52,10 +55,10 @@ rr = _Rerun()
 
 
 def write(folder: str | Path, path: str | Path, robot: str | None = None) -> Scene:
-    """Write a folder's scene as a Rerun recording, complete or not at all.
+    """Write a folder's scene as a Rerun recording, complete or not at all, and return the scene.
 
     Raises:
-        UsageError: where rerun is not installed, or there is nothing to see.
+        UsageError: rerun is not installed, or the folder has nothing to show.
     """
     path = Path(path)
     scene = drawn(folder, robot)
@@ -71,9 +74,9 @@ def write(folder: str | Path, path: str | Path, robot: str | None = None) -> Sce
 
 
 def write_beside(folder: str | Path) -> str:
-    """Write ``session.rrd`` into a folder if possible, and report the result in one line; never raises.
+    """Write ``session.rrd`` into a folder if possible, and return its name or why it failed, in one line; never raises.
 
-    A recording is a convenience: neither a missing package nor a full disk stops what it belongs to.
+    A recording is a convenience: neither a missing package nor a full disk stops the step that writes it.
     """
     try:
         write(folder, Path(folder) / FILE)
@@ -83,10 +86,11 @@ def write_beside(folder: str | Path) -> str:
 
 
 def spawn(folder: str | Path, robot: str | None = None) -> Scene:
-    """Open Rerun's window with a folder's scene.
+    """Open Rerun's window with a folder's scene, and return the scene.
 
     Raises:
-        UsageError: where no display is there, as over SSH.
+        UsageError: there is no display, as over SSH.
+        CalibError: the window did not open.
     """
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         saved = command_line("view", folder, "--save", FILE)
@@ -153,7 +157,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _size_lines(sizes: ErrorSizes) -> Iterator[str]:
-    """Yield what the text beside the plots says of rows without a measured position in the arm's base."""
+    """Yield lines, for the text beside the plots, on rows without a measured position in the arm's base."""
     for label, rows in (("fitted", ~sizes.unseen), ("unseen", sizes.unseen)):
         if not rows.any():
             continue
@@ -164,7 +168,7 @@ def _size_lines(sizes: ErrorSizes) -> Iterator[str]:
 
 
 def _rms_mm(sizes: np.ndarray) -> str:
-    """Return the rms of sizes of errors (m,) [m] as text; NaN are those of rows without one."""
+    """Return the rms of error sizes (m,) [m] as text in mm; NaN are left out, 'not stated' if all are."""
     errors_mm = 1e3 * sizes[np.isfinite(sizes)]
     if not len(errors_mm):
         return "not stated"
@@ -366,7 +370,7 @@ def _meshes(recording: RecordingStream, scene: Scene) -> None:
 
 
 def _blueprint(scene: Scene) -> Any:
-    """Return the initial layout of the recording: the arm at the left, what goes with it at the right."""
+    """Return the initial layout of the recording: the arm at the left, plots and text at the right."""
     import rerun.blueprint as rrb
 
     tabs: list[Any] = []

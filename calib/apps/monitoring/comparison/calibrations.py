@@ -1,4 +1,4 @@
-"""A calibration of a robot's geometry that is compared with another one: of a fit's folder, or of a description."""
+"""A calibration of a robot's geometry, read from a fit's folder or a description, to be compared with another one."""
 
 from __future__ import annotations
 
@@ -19,15 +19,17 @@ class Calibration:
 
     Attributes:
         name: as the user gave it.
-        robot: the calibrated arm; the nominal one of a description.
-        cell: that arm in its cell, with joint corrections.
-        free, covariance: of steps along the cell's fitted parameters (`calib.geometry.observation`); empty if nominal.
+        robot: the calibrated arm; of a description the nominal one.
+        cell: the arm in its cell, with joint corrections.
+        free, covariance: the fitted parameters in the cell's parameter vector, and the covariance of steps along them
+            (`calib.geometry.observation`); empty if nominal.
         fitted_joints: (m, n) the fitted poses [rad or m]; None if nominal.
-        metrics: of the fit; None if nominal.
-        judged: level and reason of its verdict; empty if nominal.
-        rows: errors on unseen poses, else on the fitted ones; None if nominal.
-        tolerance: asked of the fit [m]; None without.
-        serial: of the robot, as its certificate states it; empty if unknown.
+        metrics: metrics of the fit; None if nominal.
+        judged: level and reason of the fit's verdict; within a session, of that on its held-out poses; empty if
+            nominal.
+        rows: errors at held-out poses, else at the fitted ones; None if nominal.
+        tolerance: tolerance asked of the fit [m]; None without.
+        serial: serial number of the robot, as its certificate states it; empty if unknown.
     """
 
     name: str
@@ -44,7 +46,7 @@ class Calibration:
 
     @property
     def nominal(self) -> bool:
-        """Whether this is a robot's description, and nothing was fitted."""
+        """Whether this is a robot's description, with nothing fitted."""
         return self.metrics is None
 
     @property
@@ -54,9 +56,9 @@ class Calibration:
 
     @cached_property
     def rigid(self) -> tuple[Installation, np.ndarray]:
-        """The cell with the geometry that was fitted without joint corrections, and the covariance (p, p) of its arm.
+        """The cell with the fitted geometry but without joint corrections, and the covariance (p, p) of its arm.
 
-        The covariance is by the cell's whole parameter vector, zero for what is not of the arm.
+        The covariance is over the cell's whole parameter vector, zero for parameters that do not belong to the arm.
         """
         cell = replace(self.cell, chain=self.chain, deflection=Deflection())
         count = len(layout(cell).names)
@@ -68,7 +70,7 @@ class Calibration:
 
     @cached_property
     def with_corrections(self) -> tuple[Installation, np.ndarray]:
-        """The cell with all that was fitted, and the covariance (p, p) of its whole parameter vector."""
+        """The cell with all fitted parameters, and the covariance (p, p) of its whole parameter vector."""
         count = len(layout(self.cell).names)
         covariance = np.zeros((count, count))
         covariance[np.ix_(self.free, self.free)] = self.covariance
@@ -76,7 +78,7 @@ class Calibration:
 
     @property
     def residual_rms(self) -> float:
-        """Rms residual [m] of this calibration on its rows without joint corrections; 0 if nominal."""
+        """Rms residual of this calibration at the poses of `rows`, without joint corrections [m]; 0 if nominal."""
         if self.rows is None:
             return 0.0
         errors = self.rows.judged("urdf").main
@@ -89,7 +91,7 @@ def read_fits(before: Place, after: Place) -> tuple[Calibration, Calibration]:
     """Return two calibrations of one robot, read from their folders; one of the two may be nominal.
 
     Raises:
-        RobotError: where they are of different robots.
+        RobotError: they are of different robots.
     """
     earlier = later = None
     if before.fit:
@@ -145,7 +147,7 @@ def read_fit(source: Place) -> Calibration:
 
 
 def _nominal(name: str, like: Chain) -> Calibration:
-    """Return the robot of a description, between a calibrated one's links, as a calibration without covariance."""
+    """Return the nominal robot `name`, between the links of the chain `like`, as a calibration without covariance."""
     base = tip = None
     if name.endswith(".urdf"):
         base = like.base

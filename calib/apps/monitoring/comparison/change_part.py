@@ -1,4 +1,4 @@
-"""A part of a comparison: geometry or dynamics. Verdict, findings, section of the report, numbers; figures differ."""
+"""A part of a comparison, geometry or dynamics: verdict, findings, report section, numbers; subclasses add figures."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ MAX_PARAMETERS = 12
 
 @dataclass(frozen=True, eq=False)
 class ChangePart(ABC):
-    """What changed of the geometry, or of the dynamics, and whether the earlier parameters are still good enough.
+    """Change of the geometry, or of the dynamics, and whether the earlier parameters are still good enough.
 
     Attributes:
         before, after: the calibrations, with ``name``, ``judged`` and ``serial``.
-        change: the test, and more.
-        tolerance: of `today`; None without.
+        change: result of the test, and further figures of this kind.
+        tolerance: largest accepted `today`; None without.
     """
 
     kind: ClassVar[str]
@@ -47,20 +47,20 @@ class ChangePart(ABC):
     @property
     @abstractmethod
     def today(self) -> float:
-        """What the robot's error would be today with the earlier parameters, in the unit of the tolerance."""
+        """The robot's error today with the earlier parameters, in the unit of the tolerance."""
 
     @property
     @abstractmethod
     def words(self) -> str:
-        """What changed, for the verdict's reason."""
+        """The change in words, for the verdict's reason."""
 
     @abstractmethod
     def specific_findings(self) -> list[Finding]:
-        """Return the findings that this kind alone has."""
+        """Return the findings that only this kind of part has."""
 
     @abstractmethod
     def blocks(self) -> list[Block]:
-        """Return what the section says before and after the table of parameters, which stands third."""
+        """Return the report blocks of this kind; the first precedes the notes, the table of parameters follows all."""
 
     @abstractmethod
     def charts(self) -> dict[str, Chart]:
@@ -72,7 +72,7 @@ class ChangePart(ABC):
 
     @abstractmethod
     def numbers(self) -> dict[str, object]:
-        """Return the numbers that this kind alone has [SI]."""
+        """Return the numbers that only this kind of part has [SI]."""
 
     @cached_property
     def noticed(self) -> tuple[Finding, ...]:
@@ -110,7 +110,7 @@ class ChangePart(ABC):
             yield finding("other-serial-number", first=self.before.serial, second=self.after.serial, **names)
 
     def section(self) -> Section:
-        """Return a report section with verdict, what moved, changed parameters and notes."""
+        """Return a report section with verdict, changes, changed parameters and notes."""
         allowed = ""
         if self.tolerance:
             allowed = self.shown(self.tolerance)
@@ -127,7 +127,7 @@ class ChangePart(ABC):
     @property
     @abstractmethod
     def basis(self) -> str:
-        """On what `today` rests."""
+        """The measurements on which `today` is based, in words."""
 
     def to_dict(self) -> dict[str, object]:
         """Return the numbers as in ``metrics.json`` [SI]."""
@@ -146,7 +146,7 @@ class ChangePart(ABC):
 
 
 def plus_minus(value: float, sigma: float, unit: str) -> str:
-    """Return a change with its σ as text; empty without σ."""
+    """Return a change with its σ as text; empty where σ is zero or NaN."""
     if not sigma or np.isnan(sigma):
         return ""
     factor, printed = SMALL.get(unit, (1.0, unit))

@@ -1,14 +1,15 @@
 """Test of whether two estimates of a robot's parameters differ, in the combinations that data can show.
 
-With δ the difference of the combinations and Σ the sum of both covariances, V what each of p parameters does to them,
+With δ the difference of the combinations, Σ the sum of both covariances, and V the derivative of the combinations by
+each of p parameters,
 
     χ² = δᵀ Σ⁻¹ δ
 
 has as many degrees of freedom as combinations were estimated. If parameter k alone changed, by the size x, then
 δ = x v_k with v_k the column of V: x = v_kᵀ Σ⁻¹ δ / v_kᵀ Σ⁻¹ v_k, σ² = 1 / v_kᵀ Σ⁻¹ v_k, and χ² falls by (x/σ)² (Baarda
 1968, data snooping); for several parameters together, by what their columns explain. The difference is tested as a
-whole, and for the parameter that explains most. A combination that only one of two estimates has is taken out by
-conditioning: that one is as if it had kept it at the value that the other has.
+whole, and for the parameter that explains most. A combination that only one of the two estimates has is removed by
+conditioning: that estimate is treated as if it had fixed the combination at the value of the other one.
 """
 
 from __future__ import annotations
@@ -33,11 +34,11 @@ class ParameterChange(NamedTuple):
     """Change of one parameter.
 
     Attributes:
-        name, unit: of the parameter.
-        before, after: its values; one that was not fitted has its nominal value.
-        sigma: of the difference, from both covariances; 0 where it was fitted in neither.
-        alone, alone_sigma: its change if nothing else had changed; NaN where no data show it.
-        explained: by how much that lowers χ².
+        name, unit: name and unit of the parameter.
+        before, after: its values; where it was not fitted, the nominal value.
+        sigma: σ of the difference, from both covariances; 0 where it was fitted in neither.
+        alone, alone_sigma: its change, with σ, if no other parameter had changed; NaN where no data show it.
+        explained: by how much that change lowers χ².
     """
 
     name: str
@@ -52,12 +53,12 @@ class ParameterChange(NamedTuple):
 
 @dataclass(frozen=True)
 class ChangeTest:
-    """The test's result.
+    """Result of the test.
 
     Attributes:
-        chi2, freedom: of the test that nothing changed, and its degrees of freedom.
-        parameters: the one that explains most first.
-        extra: how many combinations only the earlier, and only the later one estimated.
+        chi2, freedom: χ² of the hypothesis that nothing changed, and its degrees of freedom.
+        parameters: changes of the parameters, the one that explains most first.
+        extra: number of combinations that only the earlier, and only the later calibration estimated.
     """
 
     chi2: float
@@ -67,7 +68,7 @@ class ChangeTest:
 
     @property
     def probability(self) -> float:
-        """Of so large a χ², or of one parameter that explains so much of it, where nothing changed (Bonferroni).
+        """Probability of so large a χ², or of one parameter explaining so much of it, if nothing changed (Bonferroni).
 
         1 where nothing was estimated that could have changed.
         """
@@ -81,7 +82,7 @@ class ChangeTest:
 
     @property
     def sigmas(self) -> float:
-        """The deviation of a single normal variable that is as unlikely, at most 37."""
+        """Significance of the change: the deviation of a normal variable that is as unlikely, at most 37."""
         return float(norm.isf(max(self.probability, 1e-300) / 2.0))
 
     @property
@@ -91,7 +92,7 @@ class ChangeTest:
 
     @property
     def unexplained(self) -> float:
-        """χ² that is left where only the first parameter changed."""
+        """χ² that remains if only the first parameter changed."""
         if not self.parameters:
             return self.chi2
         return max(self.chi2 - self.parameters[0].explained, 0.0)
@@ -108,7 +109,7 @@ class ChangeTest:
         return tuple(parameter.name for parameter in self.parameters[1:] if parameter.explained > best - AS_WELL)
 
     def suffices(self, explained: float, count: int) -> bool:
-        """Return whether what `count` parameters explain of χ² leaves no more than chance."""
+        """Return whether χ² remaining after `count` parameters explained `explained` of it is no more than chance."""
         residual = max(self.chi2 - explained, 0.0)
         freedom = max(self.freedom - count, 1)
         return bool(chi2.sf(residual, freedom) > CHANCE)
@@ -116,9 +117,11 @@ class ChangeTest:
 
 @dataclass(frozen=True, eq=False)
 class Tested:
-    """What is tested, whitened by its covariance: the difference (k,) and what p parameters do to it (k, p).
+    """The tested quantities, whitened by their covariance.
 
     Attributes:
+        difference: (k,) difference of the combinations.
+        columns: (k, p) derivative of the combinations by each of p parameters.
         extra: see `ChangeTest`.
     """
 
@@ -139,7 +142,7 @@ class Tested:
         return along / size**2, 1.0 / size, (along / size) ** 2
 
     def together(self, chosen: np.ndarray) -> tuple[np.ndarray, float, int]:
-        """Return the steps (p,) of several parameters that explain most, the χ² that they explain, and their number."""
+        """Return changes (p,) of several parameters that explain most together, the χ² explained, and their rank."""
         columns = self.columns[:, chosen]
         size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
         unit_columns = columns / size
@@ -153,13 +156,13 @@ class Tested:
 def tested(
     change: np.ndarray, covariances: list[np.ndarray], spans: list[np.ndarray], columns: np.ndarray
 ) -> tuple[Tested, np.ndarray]:
-    """Return what can be tested of two estimates, and the columns (k, p) before they are whitened.
+    """Return the quantities that can be tested of two estimates, and the columns (k, p) before whitening.
 
     Args:
         change: (s,) later minus earlier, of combinations of a size near 1.
-        covariances: (s, s) of either.
-        spans: (s, any) orthonormal columns: what either has estimated.
-        columns: (s, p) what each parameter does to the combinations.
+        covariances: (s, s) covariance of each estimate.
+        spans: (s, any) orthonormal columns that span the combinations of each estimate.
+        columns: (s, p) derivative of the combinations by each parameter.
     """
     no_combination = np.zeros((len(change), 0))
     extra = [no_combination, no_combination]
@@ -184,6 +187,6 @@ def tested(
 
 
 def span(columns: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis (k, r) of the space of columns (k, any), each of a size near 1 or none."""
+    """Return an orthonormal basis (k, r) of the space of columns (k, any), each of norm near 1 or zero."""
     basis, size, _ = np.linalg.svd(columns, full_matrices=False)
     return basis[:, size > SPAN]

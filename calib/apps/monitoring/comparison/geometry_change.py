@@ -1,7 +1,7 @@
-"""What moved between two calibrations of a robot: a test in identifiable combinations, and the tool's motion.
+"""Change between two calibrations of a robot: a test in identifiable combinations, and the tool's motion.
 
-With J the derivative of the target's pose over the poses of both fits, from which every motion of base and tool is
-projected out (they are not the robot's), the rows of V from J = U S Vᵀ are the combinations that poses can show. They
+With J the derivative of the target's pose at the poses of both fits, after projecting out every motion of base and tool
+(they do not belong to the robot), the rows of Vᵀ from J = U S Vᵀ are the combinations that poses can show. They
 are tested (`calib.apps.monitoring.comparison.change_test`).
 """
 
@@ -28,14 +28,15 @@ PARALLEL = 1e-2  # share of a parameter's motion that base and tool do not take 
 
 @dataclass(frozen=True, eq=False)
 class ToolMotion:
-    """Motion of the target between two calibrations at poses, base and tool placement fitted where they do not count.
+    """Motion of the target between two calibrations at poses; base and tool placement are fitted where they do not
+    count.
 
     Attributes:
-        where: what poses these are.
-        q: (m, n) [rad or m].
+        where: which poses, in words.
+        q: (m, n) joint values [rad or m].
         points: (m, 3) target positions in the base frame [m].
         position, orientation: (m,) sizes of the motion [m], [rad].
-        expected: rms of the position's motion that both covariances let expect [m].
+        expected: rms of the position's motion that is expected from both covariances alone [m].
     """
 
     where: str
@@ -53,7 +54,7 @@ class ToolMotion:
 
 @dataclass(frozen=True)
 class GeometryChange(ChangeTest):
-    """What moved between two calibrations; the test is in `ChangeTest`.
+    """Change of the geometry between two calibrations; `ChangeTest` has the test.
 
     Attributes:
         by_joint: (joint, rms motion of the target if only what describes that joint had changed [m]).
@@ -68,9 +69,13 @@ class GeometryChange(ChangeTest):
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """Target poses at joint values q: derivatives (p, 6 m) and change (6 m,), what base and tool take up projected out.
+    """Target poses at joint values q, with motions of base and tool that do not count projected out.
 
-    Turns are in units of `LEVER`.
+    Attributes:
+        q: (m, n) joint values [rad or m].
+        points: (m, 3) target positions in the base frame [m].
+        rows: (p, 6 m) derivatives of the poses by the parameters, turns multiplied by `LEVER`.
+        change: (6 m,) change of the poses, turns multiplied by `LEVER`.
     """
 
     q: np.ndarray
@@ -79,7 +84,7 @@ class _Seen:
     change: np.ndarray
 
     def motion(self, where: str, covariance: np.ndarray) -> ToolMotion:
-        """Return the targets' motion, and what the covariance (p, p) of the parameters' change lets expect of it."""
+        """Return the targets' motion, with the motion expected from the covariance (p, p) of the parameters' change."""
         motions = self.change.reshape(2, 3, -1)
         distances = np.linalg.norm(motions[0], axis=0)
         turns = np.linalg.norm(motions[1], axis=0) / LEVER
@@ -87,21 +92,21 @@ class _Seen:
         return ToolMotion(where, self.q, self.points, distances, turns, expected)
 
     def size(self, steps: np.ndarray) -> float:
-        """Return the rms motion [m] of the targets by independent steps (k, p) of the parameters."""
+        """Return the rms motion [m] of the targets under independent steps (k, p) of the parameters."""
         displacements = (steps @ self.rows).reshape(len(steps), 6, len(self.q))[:, :3]
         return float(np.sqrt(np.sum(displacements**2) / len(self.q)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """Two arms with one station and one target each, and what is known of their parameters' difference.
+    """Two arms with one station and one target each, and the difference of their parameters.
 
-    The parameters are those of the arm, then, as far as they count, of base and tool, then of the joint corrections.
+    The parameters are those of the arm, then, where they count, of base and tool, then of the joint corrections.
 
     Attributes:
-        cells: earlier and later one; a base or tool that does not count is the same in both.
-        taken_up: positions in the cells' parameter vector of the base and tool that do not count.
-        free: those of the p parameters.
+        cells: earlier and later installation; a base or tool that does not count is equal in both.
+        taken_up: indices in the cells' parameter vector of base and tool where they do not count.
+        free: indices of the p parameters.
         change: (p,) later minus earlier.
         covariances: (p, p) of either.
     """
@@ -113,7 +118,7 @@ class _Pair:
     covariances: tuple[np.ndarray, np.ndarray]
 
     def see(self, q: np.ndarray) -> _Seen:
-        """Return the targets at joint values q (m, n) [rad or m]."""
+        """Return the targets' poses and their change at joint values q (m, n) [rad or m]."""
         earlier, later = self.cells
         base_before = base_after = None
         if earlier.deflection.terms:
@@ -138,10 +143,10 @@ class _Pair:
 
 
 def compare(before: Calibration, after: Calibration, settings: DiffSettings) -> GeometryChange:
-    """Return what moved between two calibrations.
+    """Return the change of the geometry between two calibrations.
 
     Raises:
-        UsageError: where base or tool shall count, and are not known of both.
+        UsageError: base or tool shall count, but are not known of both.
     """
     pair = _pair(before, after, settings)
     chain = before.chain
@@ -213,13 +218,15 @@ def frame_changes(before: Calibration, after: Calibration) -> dict[str, np.ndarr
 
 
 def _step(T_first: np.ndarray, T_second: np.ndarray) -> np.ndarray:
-    """Return the step (6,) that leads from one placement to the other, along and about the first one's own axes."""
+    """Return the motion (6,) [m, rad] from one placement to the other, in the frame of the first."""
     step = invert(T_first) @ T_second
     return np.concatenate([step[:3, 3], rotation_vector(step[:3, :3])])
 
 
 def _compared(names_before: Sequence[str], names_after: Sequence[str]) -> tuple[int, int]:
-    """Return the numbers of the two stations, or tools, that are compared: of the first common name, or the first."""
+    """Return the indices of the two stations, or tools, that are compared: those of the first common name, else 0 and
+    0.
+    """
     for name in names_before:
         if name in names_after:
             return names_before.index(name), names_after.index(name)
@@ -284,7 +291,7 @@ def _pair(before: Calibration, after: Calibration, settings: DiffSettings) -> _P
 
 
 def _tested(pair: _Pair, sight: _Seen) -> tuple[Tested, np.ndarray]:
-    """Return the test of the combinations that the poses show, and what each parameter does to those tested (k, p)."""
+    """Return the test of the combinations that the poses show, and their derivatives (k, p) by each parameter."""
     _, size, directions = np.linalg.svd(sight.rows.T, full_matrices=False)
     directions = directions[size > SHOWN * size[0]]
     covariances = []

@@ -1,4 +1,4 @@
-"""An identified model of a robot's dynamics that is compared with another one, read from its folder."""
+"""An identified model of a robot's dynamics, read from its folder, to be compared with another one."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from calib.units import TORQUE
 
 @dataclass(frozen=True, eq=False)
 class MotionStates:
-    """States of a motion: times (N,) [s], q, v, a (N, n), and the torques (N, rows) measured there, if any."""
+    """States of a motion: times t (N,) [s]; q, v, a (N, n); measured torques (N, rows), None where there are none."""
 
     t: np.ndarray
     motion: tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -38,17 +38,17 @@ class Identified:
 
     Attributes:
         name: as the user gave it.
-        robot: on whose geometry it was identified.
+        robot: the arm on whose geometry it was identified.
         dynamics: model and values.
-        names, units: of the b estimated parameters.
-        columns: (b,) of the regressor.
-        covariance: (b, b), geometry's part included; zero for what was not measured.
-        regrouping: key of a base parameter -> standard parameter -> coefficient.
-        motions: unseen ones, else the fitted one.
-        unit: of the torques.
+        names, units: names and units of the b estimated parameters.
+        columns: (b,) their columns in the regressor.
+        covariance: (b, b), the part due to the geometry included; zero for parameters that were not measured.
+        regrouping: key of a base parameter to standard parameter to coefficient.
+        motions: held-out motions by name, else the fitted one.
+        unit: unit of the torques.
         judged: level and reason of the verdict.
-        tolerance: largest accepted share of the torque that is unexplained [%]; 0: none.
-        serial: of the robot; empty if unknown.
+        tolerance: largest accepted unexplained share of the torque [%]; 0: none.
+        serial: serial number of the robot; empty if unknown.
     """
 
     name: str
@@ -81,7 +81,7 @@ class Identified:
 
     @property
     def keys(self) -> list[Hashable]:
-        """What each estimated parameter is: its standard name, that of a drive's term with its form."""
+        """Key of each estimated parameter: its standard name; for a drive's term also its form."""
         return [_key(self.model, k) for k in self.columns]
 
 
@@ -89,8 +89,8 @@ def read_models(before: Place, after: Place) -> tuple[Identified, Identified]:
     """Return two identified models of one robot, each read from its folder.
 
     Raises:
-        UsageError: where their torques are of different kinds.
-        RobotError: where they are of different robots.
+        UsageError: their torques are of different kinds.
+        RobotError: they are of different robots.
     """
     earlier = _read(before)
     later = _read(after)
@@ -154,10 +154,11 @@ def _key(model: IdentificationModel, column: int) -> Hashable:
 
 
 def read_states(path: Path, joints: int) -> MotionStates | None:
-    """Return the states of a motion, with the torques ``measured_…`` if there are any, from a table; None without v, a.
+    """Return the states of a motion from a table, with the torques ``measured_…`` if there are any; None without q, v
+    or a.
 
     Raises:
-        UsageError: for another number of joints.
+        UsageError: another number of joints.
     """
     table = read_table(path)
     q = table.block("q")

@@ -1,4 +1,4 @@
-"""Where two calibrations are: folders of fits, of identifications, of sessions, or a robot's description."""
+"""Sources of two calibrations: folders of fits, of identifications, of sessions, or a robot's description."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Place:
-    """What one calibration is read from.
+    """Source of one calibration.
 
     Attributes:
         name: as the user gave it.
-        session: None where it is no session's folder.
-        fit, identification: folders of the results that are there; None: there is none.
+        session: the session; None where the source is not a session's folder.
+        fit, identification: folders of the results; None where there is no such result.
     """
 
     name: str
@@ -34,7 +34,7 @@ class Place:
 
     @property
     def nominal(self) -> bool:
-        """Whether it is a robot's description, not a folder."""
+        """Whether the source is a robot's description, not a folder."""
         return not (self.session or self.fit or self.identification)
 
     @property
@@ -46,7 +46,7 @@ class Place:
 
     @property
     def words(self) -> str:
-        """What it holds, in a clause."""
+        """The contents of the source, in a clause."""
         contents = []
         if self.fit:
             contents.append("geometry")
@@ -58,10 +58,14 @@ class Place:
 
 
 def place_of(source: str | Path, verb: str = "diff") -> Place:
-    """Return what a calibration is read from; what is no folder counts as a description.
+    """Return the source of a calibration; a path that is not a folder counts as a robot's description.
+
+    Args:
+        source: folder, file or name.
+        verb: the command, for messages.
 
     Raises:
-        UsageError: for a folder of something else.
+        UsageError: a folder of another kind.
     """
     path = Path(source)
     name = str(source)

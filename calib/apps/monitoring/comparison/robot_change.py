@@ -33,7 +33,7 @@ TABLES = (ToolPart.table, TorquePart.table)
 
 @dataclass(frozen=True, eq=False)
 class RobotChange(ChartedResult, Judged):
-    """What changed between two calibrations of a robot. ``print`` shows the verdict, what moved, the parameters.
+    """Change between two calibrations of a robot. ``print`` shows the verdict, the motion of the tool, the parameters.
 
     Attributes:
         parts: geometry, dynamics, or both.
@@ -46,7 +46,7 @@ class RobotChange(ChartedResult, Judged):
 
     @property
     def verdict(self) -> Verdict:
-        """Whether the earlier parameters are still within tolerance: of the worst part."""
+        """Whether the earlier parameters are still within tolerance: the verdict of the worst part."""
         worst = max(self.parts, key=lambda part: LEVELS.index(part.verdict.level))
         verdict = worst.verdict
         if len(self.parts) == 1:
@@ -63,12 +63,12 @@ class RobotChange(ChartedResult, Judged):
 
     @property
     def geometry(self) -> GeometryChange | None:
-        """What moved; None where only dynamics are compared."""
+        """The change of the geometry; None where only dynamics are compared."""
         return self._change_of("geometry")
 
     @property
     def dynamics(self) -> DynamicsChange | None:
-        """What changed of the dynamics; None where only geometries are compared."""
+        """The change of the dynamics; None where only geometries are compared."""
         return self._change_of("dynamics")
 
     def _change_of(self, kind: str) -> Any:
@@ -88,7 +88,7 @@ class RobotChange(ChartedResult, Judged):
         return Section("Change", blocks, self.verdict.level, self.verdict.reason, figures)
 
     def charts(self) -> dict[str, Chart]:
-        """Return what the figures show: the tool's motion over the workspace, changes of parameters and torque."""
+        """Return the figures by name: the tool's motion over the workspace, changes of parameters and torque."""
         charts: dict[str, Chart] = {}
         for part in self.parts:
             charts |= part.charts()
@@ -96,7 +96,9 @@ class RobotChange(ChartedResult, Judged):
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write a folder: report.html, tables of all parameters, metrics.json, and the figures as PNG."""
+        """Write a folder with report.html, tables of all parameters, metrics.json, and the figures as PNG; return the
+        folder.
+        """
         parts = []
         for part in self.parts:
             charts: dict[str, Chart] = {}
@@ -138,8 +140,8 @@ def diff(before: Compared, after: Compared, settings: DiffSettings = DEFAULT_DIF
     """Compare two calibrations of one robot: what changed, and whether the earlier parameters are still good enough.
 
     Args:
-        before, after: fits, identifications, or their folders or those of sessions: what both have is compared,
-            geometry, dynamics or both; one fit may be compared with the nominal robot (file or name).
+        before, after: fits, identifications, their folders, or folders of sessions. Geometry, dynamics or both are
+            compared, as far as both have them; one fit may be compared with the nominal robot (file or name).
         settings: tolerances, whether base and tool placement count, further motions.
 
     Returns:
@@ -147,8 +149,8 @@ def diff(before: Compared, after: Compared, settings: DiffSettings = DEFAULT_DIF
         torque, figures (`plot`), `save`.
 
     Raises:
-        UsageError: where the two have nothing in common, or a folder holds no calibration.
-        RobotError: where they are of different robots.
+        UsageError: the two have nothing in common, or a folder holds no calibration.
+        RobotError: they are of different robots.
     """
     with saved(before) as first, saved(after) as second:
         earlier = place_of(first)

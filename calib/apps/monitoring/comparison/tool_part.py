@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class ToolPart(ChangePart):
-    """What moved; ``today`` is the rms error [m] with the earlier parameters over the poses of both fits."""
+    """Change of geometry; ``today`` is the rms error [m] with the earlier parameters over the poses of both fits."""
 
     kind: ClassVar = "geometry"
     table: ClassVar = "changes.csv"
@@ -134,7 +134,7 @@ class ToolPart(ChangePart):
         return lines
 
     def _worst_joints(self, motion: ToolMotion) -> str:
-        """Return the joint values of the worst pose."""
+        """Return the joint values at the pose where the target moved most, as text."""
         values = []
         for joint, value in zip(self.before.chain.joints, motion.q[motion.position.argmax()]):
             factor, unit = JOINT[joint.kind]

@@ -1,9 +1,9 @@
-"""What changed between two identified models of a robot's dynamics: a test in base parameters, and the torque's change.
+"""Change between two identified models of a robot's dynamics: a test in base parameters, and the torque's change.
 
-The combinations are the base parameters, each by its σ; what a standard parameter, or all of a joint's friction or of
-its link, does to them is in the regrouping of the later model. They are tested (`change_test`). The change of the
-torque is what the two models differ by over motions, Δτ = W₂ χ₂ - W₁ χ₁, each with its own geometry; both
-covariances let expect (w₁ Σ₁ w₁ᵀ + w₂ Σ₂ w₂ᵀ) of its square.
+The combinations are the base parameters, each divided by its σ; their derivatives by a standard parameter, or by all of
+a joint's friction or a link's body, come from the regrouping of the later model. They are tested (`change_test`). The
+change of the torque is the difference of the two models over motions, Δτ = W₂ χ₂ - W₁ χ₁, each with its own geometry;
+by both covariances the expected square is w₁ Σ₁ w₁ᵀ + w₂ Σ₂ w₂ᵀ.
 """
 
 from __future__ import annotations
@@ -29,10 +29,12 @@ class TorqueChange:
 
     Attributes:
         where: which motion.
-        t: (N,) samples' times [s]; numbers where the table has none.
-        change, expected: (N, rows) later minus earlier, and its σ by both covariances [N m or N].
-        torque: (N, rows) of the later model.
-        unexplained: of the measured torque by the earlier and the later model, all rows [%]; None if none was measured.
+        t: (N,) times of the samples [s]; sample numbers where the table has no times.
+        change, expected: (N, rows) later minus earlier torque, and its σ by both covariances [N m or N].
+        torque: (N, rows) torque of the later model [N m or N].
+        unexplained: share of the measured torque that the earlier and the later model leave unexplained, over all rows
+            [%];
+            None if no torque was measured.
     """
 
     where: str
@@ -50,13 +52,13 @@ class TorqueChange:
 
 @dataclass(frozen=True)
 class PartChange:
-    """The friction of a joint, or the body of a link: what it explains of the difference if it changed alone.
+    """Friction of a joint, or body of a link: the share of the difference that it explains if it changed alone.
 
     Attributes:
-        name: of the part.
-        explained: of χ².
-        count: of its combinations.
-        rms: change of the torque over the first motion if nothing else had changed [N m or N].
+        name: name of the part.
+        explained: χ² explained.
+        count: number of its combinations.
+        rms: change of the torque over the first motion if only this part had changed [N m or N].
     """
 
     name: str
@@ -67,11 +69,11 @@ class PartChange:
 
 @dataclass(frozen=True)
 class DynamicsChange(ChangeTest):
-    """What changed between two identified models; the test is in `ChangeTest`.
+    """Change between two identified models; `ChangeTest` has the test.
 
     Attributes:
         parts: friction of each joint, body of each link: the one that explains most first.
-        torques: over each motion.
+        torques: change of the torque over each motion.
     """
 
     parts: tuple[PartChange, ...]
@@ -79,7 +81,7 @@ class DynamicsChange(ChangeTest):
 
     @property
     def part(self) -> PartChange | None:
-        """The part that explains most, if it explains all but chance, or `NEARLY_ALL` of χ²; else None."""
+        """The part that explains most, if what it leaves is chance, or it explains `NEARLY_ALL` of χ²; else None."""
         first = self.parts[0]
         if self.suffices(first.explained, first.count) or first.explained > NEARLY_ALL * self.chi2:
             return first
@@ -87,7 +89,7 @@ class DynamicsChange(ChangeTest):
 
 
 def compare(before: Identified, after: Identified, motions: dict[str, MotionStates]) -> DynamicsChange:
-    """Return what changed between two models of one robot, the torque over motions."""
+    """Return the change between two models of one robot, with the change of the torque over motions."""
     keys = list(dict.fromkeys([*before.keys, *after.keys]))
     values_before, covariance_before = _among(before, keys)
     values_after, covariance_after = _among(after, keys)
@@ -121,7 +123,7 @@ def compare(before: Identified, after: Identified, motions: dict[str, MotionStat
 
 
 def _among(model: Identified, keys: list[Hashable]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the values (s,) and the covariance (s, s) of a model's parameters among all that either has."""
+    """Return values (s,) and covariance (s, s) of a model's parameters in order of `keys`, zero for those it lacks."""
     indices = [keys.index(key) for key in model.keys]
     values = np.zeros(len(keys))
     values[indices] = model.values
@@ -131,7 +133,7 @@ def _among(model: Identified, keys: list[Hashable]) -> tuple[np.ndarray, np.ndar
 
 
 def _standard(before: Identified, after: Identified, keys: list[Hashable]) -> list[tuple[str, str, np.ndarray]]:
-    """Return name, unit, and what it does to the s combinations (s,), of each of these and of regrouped parameters."""
+    """Return (name, unit, derivative (s,) of the combinations) of each estimated and each regrouped parameter."""
     names_and_units = {}
     for model in (before, after):
         for key, name, unit in zip(model.keys, model.names, model.units):
@@ -159,7 +161,7 @@ def _standard(before: Identified, after: Identified, keys: list[Hashable]) -> li
 
 
 def _distinct(columns: np.ndarray, first: int) -> list[int]:
-    """Return the columns (s, p) without those that another one's change would look like; the `first` ones are kept."""
+    """Return indices of columns (s, p) that are not parallel to an earlier one; the `first` ones are always kept."""
     size = np.linalg.norm(columns, axis=0)
     unit = columns / np.where(size > 0.0, size, 1.0)
     chosen = list(range(first))
@@ -170,7 +172,7 @@ def _distinct(columns: np.ndarray, first: int) -> list[int]:
 
 
 def _parts(test: Tested, arm: IdentificationModel, names: list[str], states: MotionStates) -> tuple[PartChange, ...]:
-    """Return each joint's friction and each link's body with what it explains."""
+    """Return each joint's friction and each link's body with the χ² that it explains."""
     column_of = {name: k for k, name in enumerate(arm.names)}
     result = []
     for part, members in {**_frictions(arm), **_links(arm)}.items():
@@ -188,7 +190,7 @@ def _parts(test: Tested, arm: IdentificationModel, names: list[str], states: Mot
 
 
 def _frictions(model: IdentificationModel) -> dict[str, set[str]]:
-    """Return the names of the drive terms by the joint whose friction they are."""
+    """Return, for each joint's friction, the names of its drive terms."""
     frictions: dict[str, set[str]] = {f"the friction of joint {j + 1}": set() for j in range(model.n)}
     for term in model.columns:
         part = f"the friction of joint {term.acts[0][0] + 1}"

@@ -30,7 +30,7 @@ class _TorqueRow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TorquePart(ChangePart):
-    """What changed; ``today``: the worst share [%] that the earlier model leaves of the torques measured later."""
+    """Change of dynamics; ``today`` is the worst share [%] of later measured torques that the earlier model leaves."""
 
     kind: ClassVar = "dynamics"
     table: ClassVar = "torque_changes.csv"
@@ -40,7 +40,7 @@ class TorquePart(ChangePart):
 
     @cached_property
     def judged(self) -> TorqueChange:
-        """The motion that `today` rests on: of those measured for the later model the worst."""
+        """The motion on which `today` is based: the worst of those measured for the later model."""
         measured = [
             change for change in self.change.torques if change.unexplained and change.where in self.after.motions
         ]
