@@ -126,7 +126,7 @@ class Family(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Freedom:
-    """All coefficients (C,) of one joint that satisfy its equations: particular (C,) + null (C, c) x, with free x (c,)."""
+    """Coefficients (C,) of a joint that satisfy its equations: particular (C,) + null (C, c) x, with free x (c,)."""
 
     particular: np.ndarray
     null: np.ndarray

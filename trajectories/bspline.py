@@ -77,7 +77,7 @@ class BSpline:
         return np.array(bounds)
 
     def random(self, rng: np.random.Generator, centre: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
-        """Return variables (p,) of a random motion about `centre` (n,), its control points spread by `amplitude` (n,)."""
+        """Return variables (p,) of a random motion about `centre` (n,), control points spread by `amplitude` (n,)."""
         points = []
         for count, middle, size in zip(self.counts, centre, amplitude):
             points.append(middle + size * rng.normal(size=count))

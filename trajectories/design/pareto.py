@@ -119,7 +119,7 @@ def _of(problem: ExcitationProblem, objectives: Sequence[Objective], run: Search
 
 
 def non_dominated(values: np.ndarray) -> np.ndarray:
-    """Return which rows (m, k) are not dominated, (m,) bool: no other row is as small everywhere & smaller somewhere."""
+    """Return which rows (m, k) are not dominated, (m,) bool: no row is as small everywhere and smaller somewhere."""
     nowhere_larger = (values[:, None] <= values[None]).all(-1)
     somewhere_smaller = (values[:, None] < values[None]).any(-1)
     better = nowhere_larger & somewhere_smaller

@@ -9,7 +9,7 @@ from ..errors import BadInput
 
 
 class Law(Protocol):
-    """Interface of a robot's dynamics along a path, see `calib.dynamics.path_dynamics.PathDynamics`; arrays are (N, n)."""
+    """A robot's dynamics along a path, see `calib.dynamics.path_dynamics.PathDynamics`; arrays are (N, n)."""
 
     def along(
         self, q: np.ndarray, slope: np.ndarray, curvature: np.ndarray
