@@ -310,6 +310,8 @@ def read_file(
         from calib.data.images.image_folders import read_images
 
         blocks = [read_images(path, joints, file_options)]
+    elif path.is_dir():
+        raise MeasurementError("is a folder; give a CSV, or a folder of images with joints.csv", path)
     else:
         blocks = []
         if file_options.planned:
