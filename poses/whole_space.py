@@ -40,11 +40,9 @@ class Ceiling:
         upper: the bound.
         gap: upper / det M^(1/p) − 1, the most by which the bound may exceed the relaxed optimum, relative.
         climbs: local searches of the last round for a pose that exceeds the bound, all without success; 0: the bound
-            covers
-            the candidates and the chosen poses only.
+            covers the candidates and the chosen poses only.
         excess: by how much the best pose of these searches exceeds the largest d of the support, relative; 0 where it
-            does
-            not.
+            does not.
         support: (K, n) poses that carry the relaxed design [rad or m].
         evaluations: evaluations of d in all climbs, counted per pose.
     """

@@ -171,8 +171,7 @@ def identify_dynamics(
 
     Args:
         robot, base, tip: arguments as of `calib.load`, its result, or ``fit.robot``. For a parallel robot, the result
-            has
-            the same members.
+            has the same members.
         recordings: logs of q and torque (or current): files, ``log.npz@0:9.4`` cut, or results of `read_recording`.
         settings: method, friction, drives, payloads, gains, filters, closed loop; None: defaults.
         validate: recordings of other motion, to validate on.

@@ -72,8 +72,7 @@ def export(
     any.
     An identification is written with masses and friction, as URDF, MJCF, drives.csv and parameters.json. Each file is
     verified by an independent reader before it is moved to its place. If the verdict is not pass, a warning with the
-    reason
-    is given, and written into the URDFs and README.txt.
+    reason is given, and written into the URDFs and README.txt.
 
     Args:
         result: a fit, an identification, or the folder of one.

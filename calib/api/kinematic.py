@@ -170,8 +170,7 @@ class GeometryFit(ChartedResult, Judged, fit.Outcome):
         """Return the standard deviation (m,) [m] of the tool position error (norm over the axes) at given poses.
 
         It contains the parameters' covariance and unmodelled effects, estimated on held-out rows, and grows with the
-        distance
-        from the fitted poses. 95 % of the errors are below ``expected.discrepancy.radius`` times this value.
+        distance from the fitted poses. 95 % of the errors are below ``expected.discrepancy.radius`` times this value.
 
         Args:
             q: (m, n) joint values [rad or m].
@@ -308,8 +307,7 @@ def fit_geometry(
         options: units and columns that the files' headers do not state, priors, fixed parameters (``calib formats
             options``).
         poses: the planned poses: result of `select_poses`, its CSV, or its folder; its predicted σ are compared with
-            the
-            fit's (finding ``sigma-ratio``).
+            the fit's (finding ``sigma-ratio``).
         on_read: called with the inputs before the fit begins.
         progress: called with the name of each step; None: silent.
 

@@ -140,14 +140,12 @@ def design_excitation(
 
     Args:
         robot, base, tip: arguments as of `calib.load`, its result, or ``fit.robot``. For a parallel robot, the result
-            has
-            the same members except ``plot``.
+            has the same members except ``plot``.
         settings: period, harmonics, goals, effort of the search, playback, seed.
         model: identified dynamics that predict the torques, in memory or as a folder; None: the robot's description.
         limits: TOML file of speeds, torques, workspace, collision (``calib formats limits``), or its tables.
         options: settings of the identification that will follow, as of `calib.identify_dynamics`: the motion is
-            designed
-            for its torque rows, drive terms, couplings and payloads.
+            designed for its torque rows, drive terms, couplings and payloads.
         after: identified dynamics whose recordings the motion complements, instead of `model`: the motion that reduces
             their σ most is designed, and the reduction is predicted.
         workers: number of local processes, or the address of a Dask scheduler.
@@ -209,8 +207,7 @@ def plan_motion(
 
     Args:
         robot, base, tip: arguments as of `calib.load`, its result, or ``fit.robot``. For a parallel robot, the result
-            has
-            the same members except ``plot``.
+            has the same members except ``plot``.
         waypoints: CSV of joint values, or of poses of the tip (of the platform's coordinates); or arrays: joint values
             (m, n) [rad or m], poses of the tip (m, 4, 4) [m].
         settings: payloads, straight lines, rate, shaping, approach.

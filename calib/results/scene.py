@@ -92,8 +92,7 @@ class ErrorSizes:
     """Errors of m measured rows without a position in the arm's base frame: magnitudes only.
 
     Distances, bars, sockets, planes and images measure no position; validation rows with their own base and tool
-    placement
-    measure it in a frame that the fit's folder does not contain.
+    placement measure it in a frame that the fit's folder does not contain.
 
     Attributes:
         kind: ``position`` if the row's residual is a position (in the instrument's frame, from a socket's mean point or

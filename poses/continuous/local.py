@@ -102,8 +102,7 @@ def improved(
         existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
         evaluations: largest number of evaluations of index and gradient; a search ends by itself long before.
         tolerance: gain of the merit over `PATIENCE` iterations below which the last stage ends; stages before end at
-            ten
-            times this.
+            ten times this.
         seconds: processor time after which the search ends with the best set until then.
         sharpness: sharpness of each stage, for indices with kinks.
         report: called with every improved merit; None for no report.

@@ -37,8 +37,7 @@ def multistart_search(
         existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
         evaluations: largest number of evaluations per start.
         seconds: limit of processor time; where it is finite the starts run in this process, one after another, until
-            the
-            time is used up.
+            the time is used up.
         map: the builtin, or a parallel map that returns results in order.
         report: called after each start with its number and result; None for no report.
 

@@ -92,8 +92,7 @@ class Excitation:
         sharpness: p of the smoothing; infinite for the index itself.
         sigmas: (n,) standard deviations of the torques [N m or N]; None: 1. Infinite: that joint's rows do not count.
         existing: (b, b) information of motions recorded before, with these sigmas, which the next motion complements;
-            None
-            without such motions. From a triangular factor R of their observation matrix it is Rᵀ R.
+            None without such motions. From a triangular factor R of their observation matrix it is Rᵀ R.
         columns: (c,) indices of the regressor's columns that count; None: all.
         task: (c, c) A of the index "trace", for these columns; None: the identity.
 

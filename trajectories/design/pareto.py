@@ -64,9 +64,8 @@ def sweep(
     `second`.
 
     Bounds on the second objective, hard goals, are evenly spaced from its own optimum to its value at the optimum of
-    the
-    first. Each search starts from the best known motion within the bound, and from the motion nearest to the bound; the
-    better result counts.
+    the first. Each search starts from the best known motion within the bound, and from the motion nearest to the bound;
+    the better result counts.
 
     Levels of the second objective, a hard goal, go evenly from its own optimum to where the first one's lies. Each is
     searched from the best motion known that keeps the level, and from the motion nearest to it; the better one counts.

@@ -123,8 +123,7 @@ def one_start(
 
     Where the best motion of a stage breaks a limit between the samples by more than a share of its scale, the stage is
     repeated with those instants as extra times, from that motion or, where it cannot be repaired, from the last motion
-    that
-    keeps the limits.
+    that keeps the limits.
 
     Args:
         problem: the problem.

@@ -109,8 +109,7 @@ def ensured(
 
     A motion that does not pass is searched again from its variables, with the instants near the broken limits as extra
     times, and with more tightening of these limits. Where that does not help, the motion is made smaller about its pose
-    that
-    is furthest inside the limits.
+    that is furthest inside the limits.
 
     One that does not is searched again from there, with the instants near what it breaks, and further inside the limits
     that it breaks. Where that does not help, it is made smaller about its pose that is furthest inside.

@@ -127,15 +127,13 @@ class Commands:
             NaN for an orientation that does not count.
         sigma: (m, 2) σ of position [m] and orientation [rad] at ``q``, from the parameters' covariance.
         expected: (m, 2) standard deviation of the real tool's position error at ``q`` [m], model discrepancy included,
-            and
-            the radius within which 95 % of such errors are expected; NaN where the fit has no error model.
+            and the radius within which 95 % of such errors are expected; NaN where the fit has no error model.
         beyond: (m, n) True for joints outside the range that was measured for the fit; all False if the range is
             unknown.
         dof: pose components that count: 6, 5 or 3.
         notes: remarks on the frames and on anything unusual.
         own: (m, 2) part of ``before`` due to the arm alone, its base placed where it fits the measurements best; None
-            where
-            ``before`` is that already, or the part is unknown.
+            where ``before`` is that already, or the part is unknown.
     """
 
     targets: Targets
@@ -258,18 +256,15 @@ def computed(
     """Return the joint commands that bring the real tool to the targets.
 
     The nominal robot's joint values determine the configuration; from them the calibrated robot is led to the target
-    with
-    the smallest joint motion. Where a joint would move by more than `MAX_CORRECTION`, the arm is near a singularity:
-    the
-    joint is held back, and the remaining error is reported.
+    with the smallest joint motion. Where a joint would move by more than `MAX_CORRECTION`, the arm is near a
+    singularity: the joint is held back, and the remaining error is reported.
 
     Args:
         fitted: see `read`.
         targets: joints or poses.
         frame, tool: see the module's docstring.
         dof: pose components that count, see `calib.geometry.inverse.Goal`; None for all that the targets give and the
-            arm
-            can reach.
+            arm can reach.
         start: (n,) joint values near which targets without joints are sought [rad or m]; None for the middle of the
             limits.
         tolerance: largest accepted residual of position [m] and orientation [rad].

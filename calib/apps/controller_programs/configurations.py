@@ -135,8 +135,7 @@ def has_spherical_wrist(chain: Chain) -> bool:
 
 def configuration_of(controller: Controller, text: str) -> Configuration | None:
     """Return the configuration that a program states (`calib.apps.controller_programs.languages.Setting`); None if it
-    states
-    none.
+    states none.
     """
     readers = {"tp": _tp, "krl": _krl, "rapid": _rapid}
     reader = readers.get(controller.language)
@@ -204,8 +203,7 @@ def signs_at(chain: Chain, q: np.ndarray, upright: np.ndarray) -> np.ndarray:
     undefined.
 
     A sign is undefined at a boundary, and where the upright posture of this arm is at a boundary: then the arm's zeros
-    are
-    not those of the maker.
+    are not those of the maker.
 
     Args:
         chain: the arm.

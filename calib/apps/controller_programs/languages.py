@@ -67,8 +67,7 @@ def frames_in(program: Program, further: Mapping[str, str] | None = None) -> Pro
 
     Raises:
         UsageError: a language whose frames are not read, a tool fixed in the cell, or a frame given twice with
-            different
-            numbers.
+            different numbers.
     """
     language = LANGUAGES.get(program.controller.language)
     if language is None:

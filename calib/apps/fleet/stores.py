@@ -60,8 +60,7 @@ def held(address: str, lease: float = LEASE) -> Iterator[Path]:
         UsageError: there is no storage at the address.
         Busy: another process works on the folder.
         CalibError: it cannot be read or written (another process took over; the storage is full). Files that were
-            written
-            back before remain.
+            written back before remain.
     """
     files, root = _opened(address)
     with refused_as(CalibError, Exception, f"cannot read or write {address}: {{}}; run the same command again"):

@@ -31,12 +31,10 @@ class ToolUse:
         arms: names of the arms with this tool.
         moved: distance of the tool's median position from that of the other tools [m].
         moved_sigmas: significance of `moved`, as the deviation of a normal variable that is as unlikely, given the
-            scatter
-            among arms with one tool.
+            scatter among arms with one tool.
         times: median rms error of these arms, divided by that of the other arms.
         times_sigmas: significance of log(times), in the same sense as `moved_sigmas`. All four are None where too few
-            arms
-            are compared.
+            arms are compared.
     """
 
     tool: str

@@ -291,8 +291,7 @@ def _consistent(
 
 def _averaged(points: Table, name: str, groups: dict[int, np.ndarray], position: np.ndarray) -> np.ndarray:
     """Return a column of points, one cell per group: the mean of measured numbers, else the cell of the reading nearest
-    to
-    the mean position.
+    to the mean position.
     """
     cells = points.cells[points.index(name)]
     if _MEASURED.fullmatch(name) and cells.dtype == float:

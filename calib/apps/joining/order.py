@@ -155,8 +155,7 @@ def _predicted(
     chain: Chain, q: np.ndarray, points: np.ndarray, pose: np.ndarray, assigned: np.ndarray
 ) -> np.ndarray | None:
     """Return the nominal points (n, 3) [m] of all poses, instrument and target placed by the `assigned` points; None if
-    these
-    do not determine the placement.
+    these do not determine the placement.
     """
     block = PoseMeasurements.of(q[pose[assigned]], points[assigned], joint_names=chain.joint_names)
     try:

@@ -133,8 +133,7 @@ def read_stream(path: Path, kind: Kind) -> Stream:
 
     Raises:
         MeasurementError: a file without times, one that was measured at stops, one whose clock was restarted, or one
-            most
-            of whose rows are unusable.
+            most of whose rows are unusable.
     """
     dropped = Counter[str]()
     jumps = list[_Jump]()

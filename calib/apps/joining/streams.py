@@ -305,8 +305,7 @@ def _thinned(t: np.ndarray, q: np.ndarray, min_interval: float) -> tuple[np.ndar
     them.
 
     Also returns the values of a finding: `apart`, the median time between these rows [s]; `most`, the largest number of
-    rows
-    if that limited them; `moved`, the smallest motion of a joint if that did; else None.
+    rows if that limited them; `moved`, the smallest motion of a joint if that did; else None.
     """
     step = float(np.median(np.diff(t)))
     full = float(t[-1] - t[0]) / MAX_ROWS

@@ -37,8 +37,7 @@ class Placed(NamedTuple):
         name: names of the frame and of its reference frame.
         pose: (4, 4) in the reference frame [m].
         sigma: (6,) σ of its position [m] and of turns about the axes [rad], along the axes of the reference frame; NaN
-            where
-            the measurements do not identify it.
+            where the measurements do not identify it.
     """
 
     name: str

@@ -331,8 +331,7 @@ def _guess(plant: Plant, spread: float, seed: int) -> np.ndarray:
     """Return the robot's parameters with normal relative errors; the inertias stay physically consistent.
 
     Errors of a body are drawn until it is physically consistent (as in the survey, but body by body); where that takes
-    too
-    many draws, the spread is halved.
+    too many draws, the spread is halved.
     """
     rng = np.random.default_rng([seed, 15])
     size = plant.inertial

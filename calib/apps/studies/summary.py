@@ -140,8 +140,7 @@ def summarise(study: Study, rows: Iterable[TrialRow]) -> list[ConditionSummary]:
     """Return the summary of each condition of a study, over all methods that have rows.
 
     Rows of other conditions do not count, nor rows of an earlier version of a method. Methods that the study no longer
-    asks
-    for stay in the summary while their rows are stored.
+    asks for stay in the summary while their rows are stored.
     """
     by_digest: dict[str, dict[str, list[TrialRow]]] = {}
     for row in rows:

@@ -261,8 +261,7 @@ def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[object, ...]]:
     """Return a row of ``estimate.csv`` for each parameter, with the columns `HEADER`; RSD in percent.
 
     σ is the total; the columns of the geometry's part are omitted if the geometry is taken as exact. Friction terms
-    that
-    were switched off, and parameters fixed by a constraint, have no σ, because they were not measured.
+    that were switched off, and parameters fixed by a constraint, have no σ, because they were not measured.
     """
     identification, carried = outcome.found, outcome.carried
     estimate = identification.fitted.estimate

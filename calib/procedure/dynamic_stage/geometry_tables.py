@@ -140,12 +140,9 @@ def effects(carried: GeometryUncertainty) -> list[GeometricEffect]:
 
     Columns: `shift_sigma` is the shift of the parameter that moves most when the element changes by one σ, in units of
     that parameter's σ from torque noise; `shift_sigma_per_milli` is its shift by 1 mm or 1 mrad. `torque_rms` is the
-    rms
-    change of the rigid torque by one σ at fixed parameters, `torque_rms_left` the change that remains after the
-    parameters
-    have been estimated anew. An element matters if it alone raises some parameter's σ by more than 1 %; elements
-    without
-    σ have no entries.
+    rms change of the rigid torque by one σ at fixed parameters, `torque_rms_left` the change that remains after the
+    parameters have been estimated anew. An element matters if it alone raises some parameter's σ by more than 1 %;
+    elements without σ have no entries.
     """
     rows = []
     shifts_per_unit = _per_sigma(carried)

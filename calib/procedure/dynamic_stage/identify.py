@@ -288,8 +288,7 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
     """Return the outcome of an identification: the model, its prediction of every recording, and the verdict.
 
     If the torques refute the stated gravity, only the standard friction model is tried: richer friction, such as
-    couplings
-    between joints, would absorb the error of gravity.
+    couplings between joints, would absorb the error of gravity.
     """
     settings = inputs.options.settings
     hypotheses = gravity_hypotheses(inputs)

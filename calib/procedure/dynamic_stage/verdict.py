@@ -73,12 +73,9 @@ def judge(
     """Return the torque errors on unseen motion as a sentence, and the findings that worsen the verdict.
 
     Recordings in which the robot stands are ignored. The first list entry is the worst finding on the error of all
-    joints
-    together, among ``motion-poor``, ``torque-unexplained``, ``training-torque-unexplained`` and ``no-torque-transfer``
-    (the
-    first of equals), or, without unseen motion, the reason why there is none. ``joints-unexplained`` follows, since a
-    total
-    hides small joints.
+    joints together, among ``motion-poor``, ``torque-unexplained``, ``training-torque-unexplained`` and
+    ``no-torque-transfer`` (the first of equals), or, without unseen motion, the reason why there is none.
+    ``joints-unexplained`` follows, since a total hides small joints.
 
     Args:
         fit, validation: scores by recording; validation without repeats of the training motion.

@@ -39,8 +39,8 @@ class DesignCondition:
     """Condition numbers of the observation matrix: raw (SI units), and normalised (columns of unit norm).
 
     With earlier motions, `raw` and `normalised` are those of all motions together, `…_alone` those of the new motion,
-    and
-    `…_before` those of the earlier motions; None without earlier motions, or where the columns are not all determined.
+    and `…_before` those of the earlier motions; None without earlier motions, or where the columns are not all
+    determined.
     """
 
     raw: float
@@ -129,10 +129,9 @@ def excite(
     """Design a motion that excites the dynamics of a robot within its limits.
 
     Without goals, the logarithms of both condition numbers, raw and normalised, are minimised with equal weights; an
-    aim
-    such as ``logdet`` replaces them. With goals (``wrist=0.1``), the condition numbers become goals, too: their goal
-    values
-    are those reached by a first single-objective search (the study's advice), unless the settings state them.
+    aim such as ``logdet`` replaces them. With goals (``wrist=0.1``), the condition numbers become goals, too: their
+    goal values are those reached by a first single-objective search (the study's advice), unless the settings state
+    them.
 
     Args:
         robot, base, tip: see `calib.robot.library`.
@@ -329,8 +328,7 @@ def _condition_of(inputs: ExcitationInputs, family: Family, result: SearchResult
     """Return the condition numbers at `INSTANTS` samples over the period, without smoothing of Coulomb friction.
 
     With earlier motions they are those of all motions together; `…_alone` and `…_before` are those of the new motion
-    and
-    of the earlier motions by themselves.
+    and of the earlier motions by themselves.
     """
     columns = inputs.columns
     motion = dense_motion(family, result.x, _instants(family, result), result.factor)

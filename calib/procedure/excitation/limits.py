@@ -301,8 +301,7 @@ def read_motion_limits(
 
     Raises:
         UsageError: for an unknown key or a value that a key cannot have, and if a joint has no limit of speed, or
-            limits
-            of neither acceleration nor torque (`MotionBounds`).
+            limits of neither acceleration nor torque (`MotionBounds`).
     """
     settings, where = read(LimitsFile, *tables_of(tables, chain, source, "limits"))
     without = ()

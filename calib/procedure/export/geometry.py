@@ -60,15 +60,13 @@ def edited_urdf(robot: CalibratedChain, source: Path, for_corrections: bool = Fa
     """Return the XML of `source` with the calibrated geometry, and a sentence on the programs that verified it.
 
     Only the origins of the arm's joints change. The base link and the fixed joints after the last moving joint stay as
-    in
-    the source, since the source defines base and flange.
+    in the source, since the source defines base and flange.
 
     Args:
         robot: the calibrated robot.
         source: a URDF of the nominal robot.
         for_corrections: whether to write the geometry that is to be used with joint corrections; without them it is
-            less
-            accurate than the rigid geometry.
+            less accurate than the rigid geometry.
 
     Raises:
         RobotError: if the edited URDF, read back, has other poses than the robot.

@@ -34,16 +34,13 @@ def kinematics(robot: CalibratedChain, urdf: Path | None = None) -> tuple[str, s
     """Return the kinematics YAML for ur_description (x y z roll pitch yaw of six joint origins [m, rad]), and a remark.
 
     The frames are UR's own (base_link_inertia, then each joint about its z). They follow from the nominal arm's axes,
-    so
-    that only the calibrated part of the numbers is new. ur_description puts its tool0 at wrist_3; fixed joints after it
-    in
-    the robot's file (a flange, a tool) are not included, which the remark says.
+    so that only the calibrated part of the numbers is new. ur_description puts its tool0 at wrist_3; fixed joints after
+    it in the robot's file (a flange, a tool) are not included, which the remark says.
 
     Args:
         robot: the calibrated robot, with any base and tip links.
         urdf: URDF of the robot, for the pose of ``base_link_inertia``; None, or without this link: the pose follows
-            from
-            the axes.
+            from the axes.
 
     Raises:
         NoSuchArm: for an arm without the axes of a UR arm.
@@ -81,8 +78,7 @@ def _inertia_frame(nominal: Chain, urdf: Path | None, up: np.ndarray, ahead: np.
     """Return the pose (4, 4) of UR's base_link_inertia in the arm's base.
 
     UR's descriptions have a link with this name, turned by 180° about z relative to base_link. Without such a link, its
-    z
-    is axis 1, its -x the direction in which the arm lies at q = 0, and its origin that of the base.
+    z is axis 1, its -x the direction in which the arm lies at q = 0, and its origin that of the base.
 
     Args:
         nominal: the arm.

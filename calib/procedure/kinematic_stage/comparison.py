@@ -84,8 +84,7 @@ class Comparison:
         alone: errors of the calibrated robot as a URDF describes it, without corrections and with frames fitted to the
             same rows; None if the robot has no corrections.
         plain: errors of the plain reference, with frames fitted to the same rows; None on the fit's own rows, and
-            without
-            a plain reference.
+            without a plain reference.
         shares_frames: whether base and tool placement of another file were used.
         repeated: repeatability and accuracy from poses that were measured several times; None without such poses.
         reprojection: rms distance between detected and predicted corners, of both arms [px]; None without images.
@@ -93,8 +92,7 @@ class Comparison:
         settled: False if the placement of base and tool on these rows did not converge; then the errors are
             meaningless.
         placed_by: number of measured values, and of placement parameters fitted to them, if their difference is too
-            small
-            to judge by the errors (`MARGIN`); else None.
+            small to judge by the errors (`MARGIN`); else None.
     """
 
     blocks: tuple[PoseMeasurements, ...]

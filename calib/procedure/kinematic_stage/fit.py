@@ -84,8 +84,7 @@ class Outcome:
         """Installation of the arm before any calibration, with base and tool placed to fit the rows best.
 
         When the robot comes from an earlier fit, its nominal arm is placed anew, although the fit started from its
-        calibrated
-        geometry.
+        calibrated geometry.
         """
         nominal = self.inputs.nominal
         if nominal is self.inputs.chain:

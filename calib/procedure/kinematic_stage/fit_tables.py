@@ -145,10 +145,8 @@ def residuals(outcome: Outcome) -> tuple[Iterator[Sequence[object]], list[str]]:
     """Return the residual (measured minus predicted) of every row: fitted, held out or validation; and the header.
 
     Unseen rows also have the columns of `INTERVAL`, as in ``errors.csv`` of a session: ``sigma`` is the standard
-    deviation
-    of the calibrated arm's position error by the fit's error model, ``interval95`` the radius that contains 95 % of
-    such
-    errors, ``extrapolated`` is 1 if a joint is outside the training range.
+    deviation of the calibrated arm's position error by the fit's error model, ``interval95`` the radius that contains
+    95 % of such errors, ``extrapolated`` is 1 if a joint is outside the training range.
     """
     sets = [("fit", outcome.fit)]
     for name, unseen in outcome.inputs.unseen.items():
@@ -219,10 +217,8 @@ def write_errors(path: Path, arm: Chain, validation: Mapping[str, Comparison]) -
     """Write the errors of both arms at every validation row, and the error vectors of measured positions.
 
     For measured positions, ``x y z`` is the measured position of the target, and ``to_nominal`` and ``to_calibrated``
-    are
-    the vectors from it to the positions predicted by each arm, all in the calibrated arm's base. The columns of
-    `INTERVAL`
-    follow, as in ``residuals.csv``.
+    are the vectors from it to the positions predicted by each arm, all in the calibrated arm's base. The columns of
+    `INTERVAL` follow, as in ``residuals.csv``.
     """
     rows: list[list[object]] = []
     for name, comparison in validation.items():

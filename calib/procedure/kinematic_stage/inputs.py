@@ -351,8 +351,7 @@ def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeas
     """Return the rows of a block to fit, and the held-out rows (None for a share of 0).
 
     Poses are drawn, not rows, so that the reflectors of one pose, the two rows of a distance and the cycles of a
-    repeated
-    pose stay together.
+    repeated pose stay together.
     """
     if share == 0.0:
         return block, None

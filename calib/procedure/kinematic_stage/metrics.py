@@ -47,8 +47,7 @@ class ComparedRows:
         reprojection_px: arm -> rms distance between detected and predicted corners.
         plain: errors of the plain reference; None on the fit's own rows.
         position_means: meaning of the errors ``position_mm``: ``position`` if positions were measured, else the
-            component
-            that sockets and planes measure (`calib.geometry.accuracy`).
+            component that sockets and planes measure (`calib.geometry.accuracy`).
     """
 
     poses: int

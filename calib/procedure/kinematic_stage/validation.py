@@ -87,8 +87,7 @@ def judge(
        ``small-gain``, ``many-outliers``; without any of them: pass.
 
     The fit's other findings, those of `calib.procedure.kinematic_stage.plausibility`, and ``gross-unseen-rows`` count
-    in
-    every group; ``gross-unseen-rows`` replaces ``refuted``.
+    in every group; ``gross-unseen-rows`` replaces ``refuted``.
 
     Args:
         fit: errors of both arms on the fitted rows.
@@ -473,8 +472,7 @@ def _noticed(name: str, rows: Comparison, usual: float) -> Iterator[Finding]:
     They concern errors of the nominal arm far above its `usual` error [m] (the instrument may have moved), rows that
     may be
     wrong measurements, a placement of base and tool that did not converge or absorbed most of the errors, and the share
-    of
-    errors within the 95 % interval.
+    of errors within the 95 % interval.
     """
     before = rows.errors[0].main
     sizes = rows.errors[1].main

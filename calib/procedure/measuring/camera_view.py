@@ -213,8 +213,7 @@ class ImageObservation(Observation):
     """Whitened observation Jacobian of images for the p identifiable parameters: q (m, n) -> (m, rows, p).
 
     An image's corners are condensed to the information on the board's pose and the lens; the noise of corners and of
-    the
-    arm's repeatability is our choice (`CORNER`, `DISPLACEMENT`, `TURN`).
+    the arm's repeatability is our choice (`CORNER`, `DISPLACEMENT`, `TURN`).
 
     Attributes:
         view: camera and board.

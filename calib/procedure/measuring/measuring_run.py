@@ -238,8 +238,8 @@ def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray)
     """Return the poses (m, n) with each revolute joint within one turn, cut in the largest gap between its angles.
 
     A joint with a range above one turn reaches every angle at two values. The cut is the middle of the largest gap
-    between
-    the poses' angles (if above 30 degrees, else half a turn from the middle of the range), so that moves are short.
+    between the poses' angles (if above 30 degrees, else half a turn from the middle of the range), so that moves are
+    short.
     """
     full = 2 * np.pi
     result = q.copy()

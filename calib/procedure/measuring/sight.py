@@ -40,8 +40,7 @@ class _Behind:
         velocity: Jacobian of the target as a function of q.
         instrument: (3,) position of the instrument in the arm's base [m].
         links: indices of the links that can block the view; links next to the target in every posture are excluded,
-            since
-            the direction that the target faces accounts for them.
+            since the direction that the target faces accounts for them.
     """
 
     arm: DistanceModel

@@ -84,8 +84,7 @@ def friction(outcome: IdentificationOutcome) -> dict[str, Chart]:
     """Return the chart of friction over velocity as ``friction`` -> chart; {} for mechanisms.
 
     It shows the friction model, and the torques of the first training recording minus the rigid-body model. If a torque
-    row
-    belongs to several joints (power), it shows the model only.
+    row belongs to several joints (power), it shows the model only.
     """
     if isinstance(outcome.inputs.robot, Mechanism):
         return {}

@@ -136,8 +136,7 @@ class SessionStep:
         makes: names or patterns of the files that it writes.
         settings: sections and keys of ``session.toml`` that it depends on.
         stage: ``geometry`` or ``dynamics`` if only sessions with this stage have the step; ``need`` if only sessions
-            that
-            request an accuracy have it; empty: all sessions.
+            that request an accuracy have it; empty: all sessions.
         brings: kind of files that the user provides before the step, and their description.
         kept: kind of files after whose arrival the step is not repeated, and their description; empty: always repeated.
     """
