@@ -49,9 +49,9 @@ from calib.records import frozen
 
 MIN_STANDSTILL = 0.05  # [s] that a joint stands; shorter ones are reversals (our choice)
 MAX_MEDIAN = 0.25  # of the width of Coulomb's sign; of a speed that passes evenly through zero it is 0.5 (our choice)
-# Of the error in motion on left-out time, for which standing rows count as any others (our choice). What asks for it in
-# the open recordings is at 0.63 and 0.79 (TIAGo), what is better without at 0.87 (UR10e), 0.96 (TIAGo) and above 1:
-# with any one robot left out the others allow 0.85.
+# Of the error in motion on left-out time, for which standing rows count as any others (our choice). What asks for it
+# is at 0.63 and 0.79 (TIAGo), what is better without at 0.87 (UR10e), 0.96 (TIAGo) and above 1. Two robots decide it;
+# with either left out the other allows 0.85.
 CLEARLY_LESS = 0.85
 TRAVELS = (0.0, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05)  # over which friction at rest may fade [rad or m] (our choice)
 BREAKAWAY_ROUNDS = 3  # of a fit and the travel that its residuals ask for
@@ -276,22 +276,22 @@ def with_breakaway(
         squares.append(np.concatenate(residuals) ** 2)
         all_travels.append(np.concatenate([travel[mask, row] for travel, mask in zip(travels, moves)]))
 
-    best_cost, best_reach, best_variance = np.inf, 0.0, np.ones(len(spread))
-    for reach in TRAVELS:
+    best_cost, best_fade, best_variance = np.inf, 0.0, np.ones(len(spread))
+    for fade in TRAVELS:
         cost, variance = 0.0, np.ones(len(spread))
         for row, (square, travel) in enumerate(zip(squares, all_travels)):
             if len(square) == 0:
                 continue
-            friction = spread[row] * _remembered(travel, reach)
+            friction = spread[row] * _remembered(travel, fade)
             variance[row] = _variance_in_motion(square, friction)
             total = variance[row] + friction
             cost += float(np.sum(np.log(total) + square / total))
         if cost < best_cost:
-            best_cost, best_reach, best_variance = cost, reach, variance
+            best_cost, best_fade, best_variance = cost, fade, variance
 
     result = []
     for part, travel in zip(all_rows, travels):
-        ratio = spread * _remembered(travel, best_reach) / best_variance
+        ratio = spread * _remembered(travel, best_fade) / best_variance
         result.append(replace(part, breakaway=frozen(1.0 / np.sqrt(1.0 + ratio))))
     return result
 
@@ -315,11 +315,11 @@ def _travel_since_standstill(
     return result
 
 
-def _remembered(travel: np.ndarray, reach: float) -> np.ndarray:
-    """Return the share of the variance of friction at rest that is left after a travel."""
-    if reach == 0.0:
+def _remembered(travel: np.ndarray, fade: float) -> np.ndarray:
+    """Return the share of the variance of friction at rest that remains after a travel; `fade` is δ of the module."""
+    if fade == 0.0:
         return np.zeros(travel.shape)
-    return np.exp(-2.0 * travel / reach)
+    return np.exp(-2.0 * travel / fade)
 
 
 def _variance_in_motion(squares: np.ndarray, friction: np.ndarray) -> float:
