@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 class CalibratedRobot(Viewed):
     """A folder with a robot that was calibrated from a nominal one (``robot.toml``)."""
 
-    kind = BY_NAME["robot"]
-
     def check_arm(self, verb: str) -> None:
         stage_of(self.path, verb)
 
@@ -83,8 +81,6 @@ class CalibratedRobot(Viewed):
 class StoredFit(CalibratedRobot):
     """A fitted geometry, of `calib fit`, `tool`, `base` or `hand-eye`."""
 
-    kind = BY_NAME["fit"]
-
     @property
     def verdict(self) -> Verdict:
         """The fit's verdict; within a session, that on its unseen poses."""
@@ -111,8 +107,6 @@ class StoredFit(CalibratedRobot):
 class StoredIdentification(CalibratedRobot):
     """Identified dynamics, with the geometry that they were identified on."""
 
-    kind = BY_NAME["identification"]
-
     @property
     def verdict(self) -> Verdict:
         """The identification's verdict; within a session, that on its unseen motion."""
@@ -137,8 +131,6 @@ class StoredIdentification(CalibratedRobot):
 
 class StoredSession(Viewed):
     """A session, with the fit and the identification that its steps have completed."""
-
-    kind = BY_NAME["session"]
 
     @cached_property
     def _session(self) -> Session:
@@ -202,9 +194,9 @@ class StoredSession(Viewed):
         """Return the fit and the identification as far as the session has completed them."""
         results: list[StoredResult] = []
         if self.fit is not None:
-            results.append(StoredFit(self.fit.path))
+            results.append(StoredFit(self.fit.path, BY_NAME["fit"]))
         if self.identification is not None:
-            results.append(StoredIdentification(self.identification.path))
+            results.append(StoredIdentification(self.identification.path, BY_NAME["identification"]))
         return results
 
     def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:

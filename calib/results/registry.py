@@ -1,4 +1,4 @@
-"""The kinds of results, each registered once, and `open_result`, which opens the result at a path."""
+"""The classes of results in folders, by kind, and `open_result`, which opens the result at a path."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from calib.data.csv_table import Table, read_table
 from calib.errors import UsageError, require
 from calib.procedure.excitation.coefficients import PLANNED, RUN, SAMPLES
 from calib.procedure.report.page import Picture
-from calib.result_kinds import BY_NAME, kind_of, refusal
+from calib.result_kinds import kind_of, refusal
 from calib.results.calibrations import CalibratedRobot, StoredFit, StoredIdentification, StoredSession
 from calib.results.result import StoredResult, Viewed
 
@@ -30,18 +30,6 @@ class StoredMotion(Viewed):
             if path.is_file():
                 return path
         self.refuse("program")
-
-
-class StoredExcitation(StoredMotion):
-    """A designed motion of `calib excite`."""
-
-    kind = BY_NAME["excitation"]
-
-
-class StoredPlan(StoredMotion):
-    """A planned motion of `calib plan`."""
-
-    kind = BY_NAME["plan"]
 
 
 class StoredFile(StoredResult):
@@ -76,8 +64,6 @@ class StoredFile(StoredResult):
 class StoredSelection(StoredFile):
     """Poses of `calib select`: a CSV with its prediction and figures beside it."""
 
-    kind = BY_NAME["selection"]
-
     def beside(self) -> list[Path]:
         """Return the files of prediction and figures next to the CSV."""
         start = self.path.with_suffix("")
@@ -96,71 +82,17 @@ class StoredSelection(StoredFile):
         return scene_files.read(self.path, robot)
 
 
-class StoredRecall(StoredFile):
-    """One averaged period of a played motion: an archive of arrays, which `calib identify` reads as a recording."""
-
-    kind = BY_NAME["recall"]
-
-
-class StoredComparison(StoredResult):
-    """A comparison of two calibrations: the changes between them."""
-
-    kind = BY_NAME["comparison"]
-
-
-class StoredDrift(StoredResult):
-    """A result on the drift during a measurement."""
-
-    kind = BY_NAME["drift"]
-
-
-class StoredLog(StoredResult):
-    """A log of the calibrations of one robot."""
-
-    kind = BY_NAME["log"]
-
-
-class StoredFleet(StoredResult):
-    """A fleet: the calibrations of many arms."""
-
-    kind = BY_NAME["fleet"]
-
-
-class StoredStudy(StoredResult):
-    """A study: trials of identification methods, and their evaluation."""
-
-    kind = BY_NAME["study"]
-
-
-class StoredExport(StoredResult):
-    """An exported robot: a calibrated robot in the formats of other programs."""
-
-    kind = BY_NAME["export"]
-
-
-class StoredPackage(StoredResult):
-    """A ROS 2 package of a calibrated robot."""
-
-    kind = BY_NAME["package"]
-
-
-REGISTERED: tuple[type[StoredResult], ...] = (
-    StoredFit,
-    StoredIdentification,
-    StoredExcitation,
-    StoredPlan,
-    StoredSelection,
-    StoredRecall,
-    StoredComparison,
-    StoredDrift,
-    StoredLog,
-    StoredFleet,
-    StoredSession,
-    StoredStudy,
-    StoredExport,
-    StoredPackage,
-    CalibratedRobot,
-)
+# classes of the kinds that have functions of their own, by name; the others are plain `StoredResult`
+CLASSES: dict[str, type[StoredResult]] = {
+    "fit": StoredFit,
+    "identification": StoredIdentification,
+    "excitation": StoredMotion,
+    "plan": StoredMotion,
+    "selection": StoredSelection,
+    "recall": StoredFile,
+    "session": StoredSession,
+    "robot": CalibratedRobot,
+}
 
 
 def open_result(path: str | Path, verb: str = "result") -> StoredResult:
@@ -177,8 +109,7 @@ def open_result(path: str | Path, verb: str = "result") -> StoredResult:
     kind = kind_of(path)
     if kind is None:
         raise UsageError(refusal(path, verb))
-    opened = {stored.kind.name: stored for stored in REGISTERED}
-    return opened[kind.name](path)
+    return CLASSES.get(kind.name, StoredResult)(path, kind)
 
 
 def drawn(path: str | Path, robot: str | None = None) -> Scene:

@@ -1,7 +1,7 @@
 """The protocol of results: `Result`, fulfilled by results in memory and by results in folders.
 
 Commands that take a result open it (`calib.results.registry.open_result`) and call its methods. `StoredResult` is the
-base class of all kinds in folders; a kind with more functions has a class of its own. A method that a kind does not
+class of all kinds in folders; a kind with functions of its own has a subclass. A method that a kind does not
 support refuses with advice on the folder or command to use instead (`calib.result_kinds`).
 """
 
@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, NamedTuple, NoReturn, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, NamedTuple, NoReturn, Protocol, runtime_checkable
 
 from calib.config_types import ParsedTable
 from calib.data.csv_table import Table, read_table
@@ -101,11 +101,11 @@ class StoredResult:
 
     Attributes:
         path: path of the folder or file.
+        kind: kind of the result.
     """
 
-    kind: ClassVar[ResultKind]
-
     path: Path
+    kind: ResultKind
 
     @property
     def verdict(self) -> Verdict:
