@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from calib.api.rendering import ChartedResult, DataFrame, Judged, Progress, data_frame, listed, optional
+from calib.api.rendering import ChartedResult, DataFrame, Progress, ReportedResult, data_frame, listed, optional
 from calib.arguments import checked
 from calib.data.recordings.recording import Recording
 from calib.errors import UsageError, require
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 Recorded = str | Path | Recording
 
 
-class DynamicsModel(ChartedResult, Judged, identify.IdentificationOutcome):
+class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcome):
     """Identified dynamics with covariance and verdict. ``print`` shows errors on unseen motion, friction and
     verdict.
     """

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 import numpy as np
 
 from calib import files
-from calib.api.rendering import ChartedResult, Judged, Progress, Unjudged, data_frame, listed, optional
+from calib.api.rendering import ChartedResult, Progress, ReportedResult, WithoutVerdict, data_frame, listed, optional
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.fit_options import FitOptions, read_options
@@ -39,7 +39,7 @@ Measured = str | Path | PoseMeasurements
 Several = Measured | Sequence[Measured | Sequence[Measured]]
 
 
-class PoseSelection(ChartedResult, Unjudged, selection.Chosen):
+class PoseSelection(ChartedResult, WithoutVerdict, selection.Chosen):
     """Poses that determine a robot's geometry best. ``print`` shows index, bound and the index of random poses."""
 
     kind = BY_NAME["selection"]
@@ -124,7 +124,7 @@ class PredictedPoses(NamedTuple):
     sigma: np.ndarray
 
 
-class GeometryFit(ChartedResult, Judged, fit.Outcome):
+class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
     """A fitted geometry with covariance and verdict. ``print`` shows the ladder, errors on unseen poses and verdict."""
 
     kind = BY_NAME["fit"]

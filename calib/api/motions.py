@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from calib.api.dynamic import DynamicsModel
-from calib.api.rendering import ChartedResult, Progress, Unjudged, optional, saved
+from calib.api.rendering import ChartedResult, Progress, WithoutVerdict, optional, saved
 from calib.arguments import checked
 from calib.config import Tables
 from calib.data.poses.pose_lists import Targets
@@ -34,7 +34,7 @@ def _columns(track: Setpoints) -> Sampled:
     return track.times, track.q, track.v, track.a
 
 
-class ExcitationDesign(ChartedResult, Unjudged, design.Designed):
+class ExcitationDesign(ChartedResult, WithoutVerdict, design.Designed):
     """A motion that excites a robot's dynamics, verified within limits. ``print`` shows condition numbers and
     margins.
     """
@@ -76,7 +76,7 @@ class ExcitationDesign(ChartedResult, Unjudged, design.Designed):
         return "\n".join(folder.design_lines(self))
 
 
-class MotionPlan(ChartedResult, Unjudged, planning.Planned):
+class MotionPlan(ChartedResult, WithoutVerdict, planning.Planned):
     """The fastest motion through waypoints, within speeds and torques. ``print`` shows duration and margins."""
 
     kind = BY_NAME["plan"]

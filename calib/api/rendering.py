@@ -142,7 +142,7 @@ class Kept(Shown, ABC):
             return open_result(folder, "view").scene(robot)
 
 
-class Unjudged(Kept):
+class WithoutVerdict(Kept):
     """A result, such as a motion, that has no verdict."""
 
     @property
@@ -180,7 +180,7 @@ class ChartedResult(Kept):
         return charts.figure(charts_by_name[name])
 
 
-class Judged(Kept):
+class ReportedResult(Kept):
     """A result with a verdict, shown as a section of a report: by ``print``, and as a page in a notebook."""
 
     @abstractmethod

@@ -1,8 +1,7 @@
 """Applications: commands beside the procedure, each a package that can be deleted.
 
-An application imports from the toolkit only what `PUBLIC` names, and other applications only where
-`[tool.importlinter]`
-allows it.
+An application imports from the toolkit only what `PUBLIC` names, and other applications only where the layers of
+`[tool.importlinter]` allow it.
 """
 
 # what applications may import: the names of `import calib`, these modules, and what stands in these packages

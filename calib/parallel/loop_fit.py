@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calib import files
-from calib.api.rendering import ChartedResult, DataFrame, Judged, data_frame
+from calib.api.rendering import ChartedResult, DataFrame, ReportedResult, data_frame
 from calib.arguments import checked
 from calib.data.csv_table import Table, read_table
 from calib.data.poses.fit_options import FitOptions
@@ -63,7 +63,7 @@ FOLDS = 4
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ParallelFit(ChartedResult, Judged):
+class ParallelFit(ChartedResult, ReportedResult):
     """Result of the geometric calibration of a parallel robot: estimate, calibrated robot, errors, verdict.
 
     Attributes:

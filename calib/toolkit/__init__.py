@@ -6,6 +6,5 @@ declare their options is here itself.
 """
 
 from calib.procedure.answers import CertificateSection
-from calib.procedure.kinematic_stage.settings import Tolerance
 
-__all__ = ["CertificateSection", "Tolerance"]
+__all__ = ["CertificateSection"]

@@ -2,7 +2,7 @@
 
 from calib.api.dynamic import DynamicsModel
 from calib.api.kinematic import GeometryFit, Several, fit_geometry
-from calib.api.rendering import ChartedResult, Judged, Progress, Shown, Unjudged, saved
+from calib.api.rendering import ChartedResult, Progress, ReportedResult, Shown, WithoutVerdict, saved
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.metrics import UnseenReport
 from calib.procedure.export.delivery import prediction
@@ -36,22 +36,22 @@ __all__ = [
     "FitSettings",
     "GeometryFit",
     "IdentificationFolder",
-    "Judged",
     "Measured",
     "Note",
     "Played",
     "Progress",
+    "ReportedResult",
     "Result",
     "Scene",
     "Several",
     "Shown",
     "StoredResult",
     "Torques",
-    "Unjudged",
     "UnseenReport",
     "ValidationFolder",
     "ValidationMetrics",
     "Verdict",
+    "WithoutVerdict",
     "as_notes",
     "drawn",
     "fit_geometry",

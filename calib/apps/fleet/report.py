@@ -27,7 +27,7 @@ from calib.records import plain
 from calib.result_kinds import BY_NAME
 from calib.toolkit.installations import PLAUSIBLE
 from calib.toolkit.report_pages import Block, RecordColumn, Section, Text, table
-from calib.toolkit.result_folders import Judged, Verdict, notes_of, settle
+from calib.toolkit.result_folders import ReportedResult, Verdict, notes_of, settle
 from calib.units import small
 
 PAGE, PRIOR = "report.html", "prior"
@@ -64,7 +64,7 @@ class ArmType:
 
 
 @dataclass(frozen=True, eq=False)
-class FleetReport(Judged):
+class FleetReport(ReportedResult):
     """Comparison of the calibrations of many arms. ``print`` shows the verdict, drifts, tools and parameters.
 
     Attributes:

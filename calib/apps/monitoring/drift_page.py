@@ -19,7 +19,7 @@ from calib.toolkit.pose_data import FitOptions, read_fit_options
 from calib.toolkit.report_pages import RecordColumn, Section, Text, table
 from calib.toolkit.result_folders import (
     ChartedResult,
-    Judged,
+    ReportedResult,
     Verdict,
     load_robot,
     notes_of,
@@ -37,7 +37,7 @@ CAPTION = "Targets of repeated poses less the arm's prediction."
 
 
 @dataclass(frozen=True, eq=False)
-class DriftFound(ChartedResult, Judged):
+class DriftFound(ChartedResult, ReportedResult):
     """Drift of the target over a measurement. ``print`` shows verdict, trends and repeated poses.
 
     Attributes:

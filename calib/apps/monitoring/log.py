@@ -18,7 +18,7 @@ from calib.errors import SessionError, UsageError, command_line, require
 from calib.records import plain
 from calib.result_kinds import BY_NAME
 from calib.toolkit.report_pages import RecordColumn, Section, table
-from calib.toolkit.result_folders import ChartedResult, Judged, Unjudged, open_result
+from calib.toolkit.result_folders import ChartedResult, ReportedResult, WithoutVerdict, open_result
 from calib.toolkit.sessions import Session, folders_of, position_errors, torque_error
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ class LogLine:
 
 
 @dataclass(frozen=True, eq=False)
-class RobotLog(ChartedResult, Judged, Unjudged):
+class RobotLog(ChartedResult, ReportedResult, WithoutVerdict):
     """The calibrations of one robot, oldest first. ``print`` shows a line for each."""
 
     robot: str

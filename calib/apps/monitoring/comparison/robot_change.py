@@ -23,7 +23,15 @@ from calib.errors import Finding, UsageError, require
 from calib.records import plain
 from calib.result_kinds import BY_NAME
 from calib.toolkit.report_pages import Block, KeyFigure, Section
-from calib.toolkit.result_folders import LEVELS, ChartedResult, DynamicsModel, GeometryFit, Judged, Verdict, saved
+from calib.toolkit.result_folders import (
+    LEVELS,
+    ChartedResult,
+    DynamicsModel,
+    GeometryFit,
+    ReportedResult,
+    Verdict,
+    saved,
+)
 
 if TYPE_CHECKING:
     from calib.toolkit.report_charts import Chart
@@ -32,7 +40,7 @@ TABLES = (ToolPart.table, TorquePart.table)
 
 
 @dataclass(frozen=True, eq=False)
-class RobotChange(ChartedResult, Judged):
+class RobotChange(ChartedResult, ReportedResult):
     """Change between two calibrations of a robot. ``print`` shows the verdict, the motion of the tool, the parameters.
 
     Attributes:
