@@ -220,8 +220,8 @@ def stated_payloads(texts: Sequence[str]) -> dict[str, dict[str, object]]:
 
 def _payload(text: str) -> tuple[str, dict[str, object]]:
     """Return label and keys of a payload, given as ``label``, ``label=kg`` or ``label=kg at x,y,z``."""
-    stated, _, position = text.partition(" at ")
-    label, equals, mass = (part.strip() for part in stated.partition("="))
+    labelled_mass, _, position = text.partition(" at ")
+    label, equals, mass = (part.strip() for part in labelled_mass.partition("="))
     payload: dict[str, object] = {}
     try:
         require(label.isidentifier(), "the label", ValueError)

@@ -343,12 +343,15 @@ def _with_comment(entry: str, comment: str) -> Iterator[str]:
 
 
 def _mapping_line(name: str, entry: object) -> str:
-    """Return the line of an entry whose name the user chose; a settings table becomes an inline table."""
+    """Return the line of an entry whose name the user chose; a payload with a centre of mass becomes a table."""
+    if isinstance(entry, Payload) and entry.mass is not None and entry.com is None:
+        entry = entry.mass
     if not is_dataclass(entry):
         return rtoml.dumps({name: entry}).rstrip()
     key, _, _ = rtoml.dumps({name: 0}).partition(" =")
-    stated = {item.name: getattr(entry, item.name) for item in fields(entry) if getattr(entry, item.name) is not None}
-    return f"{key} = {{ {', '.join(rtoml.dumps(stated).splitlines())} }}"
+    values = {item.name: getattr(entry, item.name) for item in fields(entry)}
+    keys = {key_name: value for key_name, value in values.items() if value is not None}
+    return f"{key} = {{ {', '.join(rtoml.dumps(keys).splitlines())} }}"
 
 
 def example() -> str:
