@@ -8,6 +8,7 @@ from unicodedata import category
 
 from calib.config import strict
 from calib.config_types import Checked, Expect, OneOf, Real, Text, Typed
+from calib.procedure.excitation.settings import Front, Goal, Period
 
 CAMERA = ("mounting", "lens", "board", "carried", "stands")
 CELL = ("instrument_at", "cone", "facing", "box", "obstacles", *CAMERA)
@@ -94,6 +95,11 @@ class Answers:
         torques: which torques the log contains.
         payloads: label=kg of a payload for additional recordings, or 'label=kg at x,y,z' with its centre of mass in
             the tip's frame [m]; label alone if its mass is unknown; repeatable (in an answer: between semicolons).
+        goals: what the motion is for: torque (predict torques), parameters (small σ of parameters), or goals such as
+            raw=35 (condition number), wrist=0.1 (mean torque as a share of its limit), coverage=0.1; repeatable (in an
+            answer: between spaces); none: the best condition numbers.
+        period: of the motion [s].
+        front: number of trade-offs between condition number and torque goal to choose from; 0: none.
         tolerance_mm: largest accepted rms of the position on unseen poses [mm]; 0: none.
         tolerance_percent: largest accepted torque error of the exported robot on unseen motion [%]; 0: none.
         program: controller in whose language the poses are written, too: ur, krl … (calib program --list); or none.
@@ -118,6 +124,9 @@ class Answers:
     dynamics: Annotated[bool, Typed("--dynamics/--geometry-only")] | None = None
     torques: Torques | None = None
     payloads: tuple[str, ...] = ()
+    goals: tuple[Goal, ...] = ()
+    period: Period | None = None
+    front: Front | None = None
     tolerance_mm: Tolerance | None = None
     tolerance_percent: Tolerance | None = None
     program: Text | None = None

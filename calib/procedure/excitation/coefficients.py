@@ -197,15 +197,15 @@ def _spline_points(content: TrajectoryFile, path: Path) -> list[np.ndarray]:
 
 
 def _fourier_coefficients(content: TrajectoryFile, path: Path) -> list[np.ndarray]:
-    """Return [q0, a, b] of each joint as one array; refuse joints with different numbers of harmonics."""
-    count = len(content.joint[0].a or ())
+    """Return [q0, a, b] of each joint as one array, [q0] of a locked joint; refuse other numbers of harmonics."""
+    count = max(len(joint.a or ()) for joint in content.joint)
     coefficients = []
     for number, joint in enumerate(content.joint, 1):
         where = f"{path}: [[joint]] number {number}"
         if joint.q0 is None or joint.a is None or joint.b is None:
             raise UsageError(f"{where}: family fourier needs q0, a and b")
-        if not len(joint.a) == len(joint.b) == count:
-            raise UsageError(f"{where}: a and b need {count} values each, as many as joint 1's a")
+        if not len(joint.a) == len(joint.b) or len(joint.a) not in (0, count):
+            raise UsageError(f"{where}: a and b need {count} values each, as many as those of the other joints")
         coefficients.append(np.array([joint.q0, *joint.a, *joint.b], dtype=float))
     return coefficients
 

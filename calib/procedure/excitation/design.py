@@ -12,6 +12,7 @@ from calib.config import Tables
 from calib.dynamics.load_cases import LoadCases
 from calib.errors import UsageError
 from calib.identification.settings import IdentificationSettings
+from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.excitation.excited_model import ExcitedModel
 from calib.procedure.excitation.goals import GUARD, missed, objectives_of, read_goals, torque_slack, wrist
 from calib.procedure.excitation.inputs import ExcitationInputs, read_inputs
@@ -19,6 +20,7 @@ from calib.procedure.excitation.limits import MotionLimits, located
 from calib.procedure.excitation.playback import Playback, check_start, play
 from calib.procedure.excitation.prediction import MotionOutlook, PredictedSigma, foretell
 from calib.procedure.excitation.settings import COARSE, DEFAULT_DESIGN, HARMONICS, ExcitationSettings, split_goal
+from calib.procedure.excitation.stored_front import StoredFront, as_search_result
 from calib.robot.calibrated import CalibratedChain
 from calib.trajectories.basis import Family
 from calib.trajectories.bspline import bspline_family
@@ -58,6 +60,8 @@ class DesignCondition:
 Progress = Callable[[str], None]
 Search = Callable[..., SearchResult]
 
+# degree of splines, where a family does not state it
+DEFAULT_DEGREE = 5
 # over the period, at which condition numbers are reported
 INSTANTS = 1000
 # index evaluations of the search for the ends of a front of trade-offs
@@ -77,8 +81,10 @@ class Designed:
             friction.
         goals: stated goals: name, requested value, weight, and reached value (by `exact` of the inputs' model).
         front: trade-offs between goals; None if not requested.
+        stored_front: the front with its motions, as the folder keeps it; None without a front.
         playback: setpoints for the controller.
         notes: remarks for the user.
+        doubts: those of the remarks that are on goals: missed, or decided by typical friction.
         outlook: prediction of what the motion identifies; None without torque limits, from which torque errors are
             assumed.
         predicted: predicted σ of the parameters; empty without `outlook`.
@@ -96,6 +102,12 @@ class Designed:
     notes: tuple[str, ...]
     outlook: MotionOutlook | None = None
     predicted: Sequence[PredictedSigma] = ()
+    stored_front: StoredFront | None = None
+    doubts: tuple[str, ...] = ()
+
+    def periodic(self, motion: SearchResult) -> Periodic:
+        """Return a result of the search as a periodic motion."""
+        return _periodic(motion, self.inputs, self.settings, self.family)
 
     @property
     def family(self) -> Family:
@@ -123,6 +135,7 @@ def excite(
     tip: str | None = None,
     options: IdentificationSettings | None = None,
     after: Path | None = None,
+    picked: StoredFront | None = None,
     map: Callable = map,
     progress: Progress | None = None,
 ) -> Designed:
@@ -140,6 +153,7 @@ def excite(
         limits: see `calib.procedure.excitation.limits`.
         options: options of the identification that will follow: torque rows, drive terms, payloads.
         after: folder of an identification whose recordings the motion shall complement; replaces `model`.
+        picked: front of an earlier design with the same settings, whose designed motion is taken instead of a search.
         map: function that runs the starts of the search, possibly in parallel (`calib.workers`).
         progress: called with the name of each step; None: silent.
 
@@ -151,7 +165,7 @@ def excite(
     """
     inputs = read_inputs(robot, settings, model, limits, base, tip, options, after)
     try:
-        return search_motion(inputs, settings, map, progress)
+        return search_motion(inputs, settings, map, progress, picked)
     except NothingFeasible as error:
         raise located(error) from error
 
@@ -161,9 +175,16 @@ def _silent(stage: str) -> None:
 
 
 def search_motion(
-    inputs: ExcitationInputs, settings: ExcitationSettings, map: Callable = map, progress: Progress | None = None
+    inputs: ExcitationInputs,
+    settings: ExcitationSettings,
+    map: Callable = map,
+    progress: Progress | None = None,
+    picked: StoredFront | None = None,
 ) -> Designed:
-    """Search for an exciting motion of an arm, or, for a parallel robot, of the platform's coordinates."""
+    """Search for an exciting motion of an arm, or, for a parallel robot, of the platform's coordinates.
+
+    With `picked`, the designed motion of an earlier front is verified and taken instead.
+    """
     show = progress or _silent
 
     def report(number: int, total: int, stage: str) -> None:
@@ -180,18 +201,24 @@ def search_motion(
     search = partial(
         design, evaluations=settings.evaluations, method=settings.solver, seed=settings.seed, map=map, report=report
     )
-    motion, problem = _searched(problem, goals, settings.starts, search, show)
+    if picked is None:
+        motion, problem = _searched(problem, goals, settings.starts, search, show)
+    else:
+        motion, problem = _picked(problem, goals, picked, inputs)
 
     show("verifying")
     motion, problem = _with_whole_samples(motion, problem, settings.rate)
     with finishing():
         motion, proof = ensured(problem, motion, checked)
-    front = None
-    if settings.front and not motion.interrupted:
+    front = None if picked is None else picked.values
+    stored = picked
+    if picked is None and settings.front and not motion.interrupted:
         # the motion exists: what follows may be cut short
         with suppress(KeyboardInterrupt):
             front = _front(problem, inputs, motion, goals, settings.front, settings.evaluations, report)
             front, motion, proof = _nearest_goals(front, problem, goals, inputs, (motion, proof), checked)
+            motions = [_periodic(result, inputs, settings, problem.family) for result in front.found]
+            stored = StoredFront(front, tuple(motions))
     with finishing():
         playback = play(problem.family, motion, inputs, settings)
         condition_numbers = _condition_of(inputs, problem.family, motion, settings.repeat)
@@ -222,6 +249,38 @@ def search_motion(
         notes=(*inputs.limits.notes, *inputs.model.notes, *notes, *inputs.columns.notes, *goal_notes, *playback.notes),
         outlook=outlook,
         predicted=predicted,
+        stored_front=stored,
+        doubts=goal_notes,
+    )
+
+
+def _picked(
+    problem: ExcitationProblem, goals: Sequence[AttainmentGoal], front: StoredFront, inputs: ExcitationInputs
+) -> tuple[SearchResult, ExcitationProblem]:
+    """Return the designed motion of a front, and the problem with the goals."""
+    joint_names, chain = front.designed.joint_names, inputs.chain
+    if joint_names != chain.joint_names:
+        joints, expected = ", ".join(joint_names), ", ".join(chain.joint_names)
+        raise UsageError(f"the front is of a robot with the joints {joints}; {chain.name} has {expected}")
+    motion = as_search_result(front.designed, problem.family)
+    if goals:
+        problem = replace(problem, goals=tuple(goals))
+    dense = dense_motion(problem.family, motion.x, _instants(problem.family, motion), motion.factor)
+    regressor = inputs.model.exact.regressor(dense.q, dense.v, dense.a)
+    return replace(motion, merit=merit(problem, exact_values(problem, dense, regressor))), problem
+
+
+def _periodic(motion: SearchResult, inputs: ExcitationInputs, settings: ExcitationSettings, family: Family) -> Periodic:
+    """Return a result of the search as a periodic motion."""
+    return Periodic(
+        joint_names=inputs.chain.joint_names,
+        kinds=tuple(joint.kind for joint in inputs.chain.joints),
+        period=family.period * motion.factor,
+        rate=settings.rate,
+        repeat=settings.repeat,
+        kind=settings.family,
+        coefficients=tuple(family.coefficients(motion.x)),
+        degree=getattr(family, "degree", DEFAULT_DEGREE),
     )
 
 

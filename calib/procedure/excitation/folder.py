@@ -12,8 +12,7 @@ import numpy as np
 from calib import files
 from calib.errors import counted
 from calib.folders import METRICS, check_target, write_staged
-from calib.procedure.excitation import coefficients, prediction
-from calib.procedure.excitation.coefficients import Periodic
+from calib.procedure.excitation import coefficients, prediction, stored_front
 from calib.procedure.excitation.design import INSTANTS, Designed
 from calib.procedure.excitation.limits import MotionBounds
 from calib.procedure.excitation.planning import Planned
@@ -22,7 +21,6 @@ from calib.records import plain
 from calib.robot import description
 from calib.robot.chain import Chain
 from calib.robot.tables import dumps
-from calib.trajectories.design.pareto import Front
 from calib.trajectories.design.verify import dense_motion
 from calib.trajectories.messages import joint_trajectory, to_json, to_yaml
 from calib.trajectories.setpoints import Setpoints
@@ -32,18 +30,16 @@ from calib.units import headings, motion_units
 # files that identify the folder of an earlier run
 DESIGN = (METRICS, coefficients.SAMPLES, coefficients.NAME)
 PLAN = (METRICS, coefficients.PLANNED, "trajectory.yaml", "trajectory.json")
-FRONT = "front.csv"
 APPROACH = "approach.csv"
 REHEARSAL = "rehearsal.csv"
 FIGURES = tuple(f"plot_{name}.png" for name in ("motion", "path", "history", "front", "profile", "outlook"))
-# files of an earlier run that a new one replaces
-ALL = (*DESIGN, *PLAN[1:], coefficients.ARM, coefficients.RUN, prediction.NAME, FRONT, APPROACH, REHEARSAL, *FIGURES)
+# files and folders of an earlier run that a new one replaces
+FRONT = (stored_front.TABLE, stored_front.FOLDER)
+ALL = (*DESIGN, *PLAN[1:], coefficients.ARM, coefficients.RUN, prediction.NAME, *FRONT, APPROACH, REHEARSAL, *FIGURES)
 # of limits, as `motion_units` has them
 KINDS = ("position", "velocity", "acceleration", "torque")
 # points per second of the ROS message, whose controllers interpolate (our choice)
 MESSAGES = 100.0
-# degree of splines, where a family does not state it
-DEFAULT_DEGREE = 5
 
 
 def check_design_target(out: Path, inputs: Sequence[str | Path | None] = ()) -> None:
@@ -68,21 +64,11 @@ def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path],
     """
 
     def write(folder: Path) -> None:
-        settings, family, playback = designed.settings, designed.family, designed.playback
+        playback = designed.playback
         chain, bounds = designed.inputs.chain, designed.inputs.limits.bounds
         period = one_period(designed)
         _write_setpoints(period, bounds, folder / coefficients.SAMPLES)
-        motion = Periodic(
-            chain.joint_names,
-            tuple(joint.kind for joint in chain.joints),
-            designed.period,
-            settings.rate,
-            settings.repeat,
-            settings.family,
-            tuple(family.coefficients(designed.found.x)),
-            getattr(family, "degree", DEFAULT_DEGREE),
-        )
-        table = coefficients.table(motion, chain.name, bounds.lines())
+        table = coefficients.table(designed.periodic(designed.found), chain.name, bounds.lines())
         files.write(folder / coefficients.NAME, dumps(table))
         if playback.approach is not None or playback.repeat > 1:
             _write_setpoints(playback.run, bounds, folder / coefficients.RUN)
@@ -91,21 +77,13 @@ def write_design(designed: Designed, out: Path, draw: Callable[[Designed, Path],
         _write_messages(playback.run, bounds, folder, max(1, round(period.rate / MESSAGES)))
         if draw is not None:
             draw(designed, folder)
-        if designed.front is not None and len(designed.front.values):
-            _write_front(designed.front, folder)
+        if designed.stored_front is not None:
+            stored_front.write(designed.stored_front, chain.name, bounds.lines(), folder)
         if designed.outlook is not None:
             prediction.write(designed.predicted, folder)
         files.write_json(folder / METRICS, design_metrics(designed))
 
     return write_staged(out, ALL, write)
-
-
-def _write_front(front: Front, folder: Path) -> None:
-    """Write the trade-offs between goals as a table, one row per motion."""
-    rows = []
-    for k, values in enumerate(front.values):
-        rows.append([*map(float, values), bool(front.best[k]), k == front.designed])
-    files.write_table(folder / FRONT, [*front.names, "not dominated", "designed"], rows)
 
 
 def write_plan(planned: Planned, out: Path, draw: Callable[[Planned, Path], None] | None = None) -> Path:
@@ -259,7 +237,12 @@ def design_lines(designed: Designed) -> list[str]:
         )
     for name, goal, _, value in designed.goals:
         lines.append(f"goal {name}: {value:.4g} (asked: {goal:.4g})")
-    lines.append(f"{motion.evaluations} evaluations, {motion.feasible:.0%} of them feasible, {motion.seconds:.1f} s")
+    if motion.evaluations:
+        shares = f"{motion.feasible:.0%} of them feasible"
+        lines.append(f"{motion.evaluations} evaluations, {shares}, {motion.seconds:.1f} s")
+    if designed.front is not None:
+        front = designed.front
+        lines.append(f"motion {front.designed + 1} of the {len(front.values)} of the front ({stored_front.TABLE})")
     margins = []
     for name, margin in proof.worst.items():
         margins.append(f"{name} {margin.margin:.3g} {margin.unit} ({margin.label}, {margin.time:.2f} s)")

@@ -48,6 +48,7 @@ Goal = Annotated[str, Checked(_goal)]
 HardGoal = Annotated[str, Checked(lambda text: _goal(text, ()))]
 Rate = Annotated[float, Real(above=0.0, most=1e5, unit="Hz")]
 Period = Annotated[float, Real(above=0.0, most=3600.0, unit="s")]
+Front = Annotated[int, Whole(0, 1000)]
 Slower = Annotated[float, Real(least=1.0, most=1000.0)]
 Starts = Annotated[int, Whole(1, 10_000)]
 Evaluations = Annotated[int, Whole(1, 10_000_000)]
@@ -113,7 +114,7 @@ class ExcitationSettings:
     evaluations: Evaluations = 1500
     solver: Annotated[Solver, OneOf(get_args(Solver))] = "slsqp"
     seed: Seed = 0
-    front: Annotated[int, Whole(0, 1000)] = 0
+    front: Front = 0
     start: Start | None = None
     repeat: Annotated[int, Whole(1, 10_000)] = 1
     slower: Slower = 1.0

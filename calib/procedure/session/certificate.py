@@ -8,7 +8,7 @@ from calib import files
 from calib.data.poses import CORNERS, JOINTS
 from calib.errors import command_line
 from calib.extensions import Point
-from calib.folders import CERTIFICATE, ESTIMATE, METRICS, PAGES, REPORT
+from calib.folders import CERTIFICATE, ESTIMATE, METRICS, PAGES, REPORT, read_estimate
 from calib.procedure.excitation import coefficients
 from calib.procedure.export.delivery import prediction
 from calib.procedure.kinematic_stage.folder import SCHEMA, URDF
@@ -206,7 +206,7 @@ def _setup(session: Session, metrics: FitMetrics | None) -> list[Entry]:
         allowed = "none given: pass below 10 %"
         if section.tolerance_percent:
             allowed = f"{section.tolerance_percent:g} % on unseen motion"
-        payloads = ", ".join(f"{label} {payload}" for label, payload in section.payloads.items())
+        payloads = ", ".join(_payloads(session))
         rows += [
             ("recordings", _names(session.brought("training", "unseen"))),
             ("torques", TORQUES[section.torques]),
@@ -236,6 +236,20 @@ def _instrument(session: Session, metrics: FitMetrics) -> str:
     if instrument.sigma_orientation:
         sigma += f", {1e3 * instrument.sigma_orientation:g} mrad"
     return f"{instrument.name}, {measures}, {sigma}"
+
+
+def _payloads(session: Session) -> Iterator[str]:
+    """Yield for each payload its label, what was stated of it, and its identified mass."""
+    identified = {}
+    if session.settings.dynamics.payloads and (session.identification.path / ESTIMATE).exists():
+        identified = {row.name: row for row in read_estimate(session.identification.path)}
+    for label, payload in session.settings.dynamics.payloads.items():
+        text = f"{label} {payload}"
+        mass = identified.get(f"M{label}")
+        if mass is not None:
+            sigma = f" ± {mass.sigma:.2g}" if mass.sigma else ""
+            text += f" (identified: {mass.value:.4g}{sigma} kg)"
+        yield text
 
 
 def _names(paths: list[Path]) -> str:

@@ -5,6 +5,7 @@ A waiting session prints two lines: what to do at the robot, and which file to p
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 from rich.console import RenderableType
@@ -28,7 +29,7 @@ from calib.procedure.measuring.pose_limits import read_limits, tables_of
 from calib.procedure.report import page
 from calib.procedure.robot_kinds import stage_of
 from calib.procedure.session import steps
-from calib.procedure.session.dynamics_steps import unrecorded_payloads
+from calib.procedure.session.dynamics_steps import pick_motion, unrecorded_payloads
 from calib.procedure.session.folder import POSES, UNSEEN, WAYS, Say, Session, create, locked, open_session, read_state
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.questions import instrument_named
@@ -297,7 +298,9 @@ def _limits(
     return {LIMITS: f"{LIMITS_HEAD}{dumps(tables)}", **files}, LIMITS
 
 
-def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", plots: bool = True) -> _Stop:
+def go_on(
+    folder: Path, say: Say, progress: Say, command: str, again: str = "", plots: bool = True, pick: int = 0
+) -> _Stop:
     """Run all steps whose inputs exist, and return the step that waits for input, with instructions.
 
     Args:
@@ -306,9 +309,13 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", 
         command: name of the command for the record.
         again: name of a step to repeat, with all steps that depend on it; empty: none.
         plots: whether to draw figures.
+        pick: number of the front's motion that becomes the training motion; 0: none.
     """
     session = open_session(folder, plots)
     with locked(session, say):
+        if pick:
+            step = steps.find(session, "excite")
+            steps.run_instead(session, step, partial(pick_motion, pick), say, progress, command)
         if again:
             steps.forget(session, steps.find(session, again))
         state = steps.run_next(session, say, progress, command)

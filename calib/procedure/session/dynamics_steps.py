@@ -17,7 +17,7 @@ from calib.column_changes import Change
 from calib.data.recordings.recording import Recording, parse_cut
 from calib.data.recordings.recording_files import read_recording
 from calib.dynamics.torque_rows import torque_rows
-from calib.errors import CalibError, Finding, finding, refuse_data
+from calib.errors import CalibError, Finding, command_line, finding, refuse_data
 from calib.identification.checks.recorded_motion import (
     EDGE_TIME,
     DesignedMotion,
@@ -30,9 +30,10 @@ from calib.identification.identify_options import FileSettings, IdentifyOptions,
 from calib.procedure.dynamic_stage import identify as identifying
 from calib.procedure.dynamic_stage import inputs
 from calib.procedure.dynamic_stage.identify import DynamicsAssessment, assess
-from calib.procedure.excitation import coefficients, prediction
+from calib.procedure.excitation import coefficients, prediction, stored_front
 from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.excitation.settings import ExcitationSettings
+from calib.procedure.excitation.stored_front import StoredFront
 from calib.procedure.findings import UNJUDGED, Note, Verdict, as_notes, lines_of
 from calib.procedure.robot_kinds import joints_of
 from calib.procedure.session.folder import CUTS, MOTION_CHECKED, ROUND, Say, Session
@@ -99,7 +100,7 @@ def unrecorded_payloads(session: Session) -> list[str]:
     return [label for label in session.settings.dynamics.payloads if label not in carried]
 
 
-def excite(session: Session, say: Say) -> list[str]:
+def excite(session: Session, say: Say) -> list[str | Note]:
     """Design the training motion and the validation motion, and return notes."""
     section = session.settings.dynamics
     if not section.plan:
@@ -148,7 +149,22 @@ def _validation_settings(session: Session) -> ExcitationSettings:
     )
 
 
-def _design(session: Session, name: str, settings: ExcitationSettings, say: Say) -> list[str]:
+def pick_motion(number: int, session: Session, say: Say) -> list[str | Note]:
+    """Make motion `number` of the front the training motion, design the validation motion for it, and return notes.
+
+    Raises:
+        UsageError: if the training motion has no front, or no such motion.
+    """
+    picked = stored_front.read(session.path("6-excitation/training")).with_designed(number)
+    notes = _design(session, "training", _training_settings(session), say, picked)
+    if session.settings.dynamics.validation:
+        notes += _design(session, "validation", _validation_settings(session), say)
+    return notes
+
+
+def _design(
+    session: Session, name: str, settings: ExcitationSettings, say: Say, picked: StoredFront | None = None
+) -> list[str | Note]:
     """Design a motion, write its folder, and return notes; figures and details of the training motion alone."""
     from calib.procedure.excitation import design
     from calib.procedure.excitation import folder as motion_folder
@@ -161,6 +177,7 @@ def _design(session: Session, name: str, settings: ExcitationSettings, say: Say)
         settings,
         limits=session.named(session.settings.dynamics.limits),
         options=options_of(session).settings,
+        picked=picked,
         progress=report_progress,
     )
     # a session is resumed, not gone on with half a search
@@ -177,7 +194,14 @@ def _design(session: Session, name: str, settings: ExcitationSettings, say: Say)
         f"normalised, {columns} columns; all limits are respected"
     ]
     if name == "training":
-        remarks = (*designed.inputs.limits.bounds.lines(), *designed.notes)
+        notes += [Note(f"{name}: {doubt}", is_warning=True) for doubt in designed.doubts]
+        if designed.front is not None:
+            count = len(designed.front.values)
+            choose = command_line("next", "--pick", "N", session.folder)
+            table = session.path("6-excitation/training/front.csv")
+            notes.append(Note(f"{name}: {count} motions to choose from ({table}): {choose}", is_warning=True))
+        remarks = [*designed.inputs.limits.bounds.lines()]
+        remarks += [note for note in designed.notes if note not in designed.doubts]
         notes += [f"{name}: {remark}" for remark in remarks]
     return notes
 

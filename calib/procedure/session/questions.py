@@ -15,6 +15,7 @@ from calib.data.images.lens import read_lens
 from calib.data.poses import BOARD, IMAGES, IN_HAND, TO_HAND
 from calib.errors import CalibError, UsageError, one_of, refused_as, require
 from calib.procedure.answers import CAMERA, CELL, Answers, CertificateSection
+from calib.procedure.excitation.settings import DEFAULT_DESIGN
 from calib.procedure.measuring.constraints_file import AXES, ConstraintsFile
 from calib.procedure.session.settings import NOTHING, InstrumentSection
 from calib.records import FieldValues
@@ -98,8 +99,10 @@ class Question:
                 return camera and (answers.mounting or "").lower() not in UNSAID
             case "dynamics":
                 return not nothing
-            case "torques" | "payloads" | "tolerance_percent":
+            case "torques" | "payloads" | "goals" | "period" | "tolerance_percent":
                 return answers.dynamics is not False
+            case "front":
+                return answers.dynamics is not False and any("=" in goal for goal in answers.goals)
             case "tolerance_mm" | "program":
                 return not nothing
         return True
@@ -123,6 +126,9 @@ DEFAULTS = {
     "dynamics": "yes",
     "torques": "motor",
     "payloads": "none",
+    "goals": "none",
+    "period": f"{DEFAULT_DESIGN.period:g}",
+    "front": "0",
     "tolerance_mm": "0",
     "tolerance_percent": "0",
     "details": "yes",
@@ -150,6 +156,12 @@ def with_answer(answers: Answers, question: Question, text: str) -> Answers:
             value = None if is_empty else text
         case "payloads":
             value = [] if is_empty else [part.strip() for part in text.split(";")]
+        case "goals":
+            value = [] if is_empty else text.split()
+        case "period":
+            value = Real(quantity="1").read(text)
+        case "front":
+            value = int(text) if text.isdecimal() else text
         case "obstacles":
             value = [text]
         case "dynamics" | "details":
@@ -176,8 +188,17 @@ def checked(answers: Answers) -> FieldValues:
     if of_camera and _measures(answers) != IMAGES:
         raise CalibError(f"--{of_camera[0]} applies to a camera that takes images; the instrument is {instrument}")
     dynamics = answers.dynamics is not False
-    if not dynamics and (answers.payloads or answers.torques):
-        raise UsageError("--payload and --torques apply to the dynamics, which --geometry-only excludes")
+    of_dynamics = {
+        "payload": answers.payloads,
+        "torques": answers.torques,
+        "goal": answers.goals,
+        "period": answers.period,
+        "front": answers.front,
+    }
+    for option, answer in of_dynamics.items():
+        require(
+            dynamics or not answer, f"--{option} applies to the dynamics, which --geometry-only excludes", UsageError
+        )
 
     limits: Path | dict[str, object] | None = answers.limits
     if answers.limits is None:
@@ -195,6 +216,9 @@ def checked(answers: Answers) -> FieldValues:
         "tool": answers.tool,
         "program": answers.program,
         "torques": answers.torques,
+        "goals": list(answers.goals),
+        "period": answers.period,
+        "front": answers.front,
         "tolerance_mm": answers.tolerance_mm,
         "tolerance_percent": answers.tolerance_percent,
     }

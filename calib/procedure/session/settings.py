@@ -25,6 +25,7 @@ from calib.procedure.excitation.settings import (
     DEFAULT_DESIGN,
     HARMONICS,
     Evaluations,
+    Front,
     Goal,
     HardGoal,
     Harmonics,
@@ -210,7 +211,7 @@ class DynamicsSection:
     rate: Rate = DEFAULT_DESIGN.rate
     goals: tuple[Goal, ...] = ()
     hard: tuple[HardGoal, ...] = ()
-    front: Annotated[int, Whole(0, 1000)] = 0
+    front: Front = 0
     repeats: Annotated[int, Whole(1)] = 3
     starts: Starts = DEFAULT_DESIGN.starts
     evaluations: Evaluations = DEFAULT_DESIGN.evaluations

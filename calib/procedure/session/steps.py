@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
-from calib.errors import SessionError
+from calib.errors import SessionError, require
 from calib.extensions import Point
 from calib.files import fingerprint
 from calib.folders import COVARIANCE, ESTIMATE, METRICS, REPORT
@@ -125,6 +125,10 @@ class StepSetting:
     keys: tuple[str, ...] = ()
 
 
+# makes the outputs of a step and returns notes
+Make = Callable[[Session, Say], Sequence[str | Note]]
+
+
 @dataclass(frozen=True)
 class SessionStep:
     """A step of a session: inputs, outputs, settings and function.
@@ -143,7 +147,7 @@ class SessionStep:
 
     name: str
     purpose: str
-    make: Callable[[Session, Say], Sequence[str | Note]]
+    make: Make
     reads: tuple[Input, ...]
     makes: tuple[str, ...]
     settings: tuple[StepSetting, ...]
@@ -485,6 +489,28 @@ def run_next(session: Session, say: Say, progress: Say, command: str = "calib ne
         if pending[0].kind == WAITING:
             return pending[0]
         _run(session, pending[0].step, say, progress, command)
+
+
+def run_instead(session: Session, step: SessionStep, make: Make, say: Say, progress: Say, command: str) -> None:
+    """Run a step with another function, such as one that takes a stored motion instead of a search.
+
+    Args:
+        session: the session, locked.
+        step: the step.
+        make: function that makes the step's outputs and returns notes.
+        say, progress: functions that print permanent lines, and progress messages.
+        command: the command for the record.
+
+    Raises:
+        SessionError: if an earlier step is not completed, or people have carried out what the step planned.
+    """
+    for state in states(session):
+        if state.step.name == step.name:
+            break
+        require(state.kind in (DONE, KEPT), f"first complete the step {state.step.name}", SessionError)
+    kinds, reason = step.kept
+    require(not session.brought(*kinds), f"step {step.name}: {reason}", SessionError)
+    _run(session, replace(step, make=make), say, progress, command)
 
 
 def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: str) -> None:
