@@ -78,8 +78,9 @@ class DriftFound(ChartedResult, ReportedResult):
         return Section("Drift", blocks, self.verdict.level, self.verdict.reason)
 
     def charts(self) -> dict[str, Chart]:
-        """Return the figures by name: displacement of the target at repeated poses, with the trend; empty without
-        trends.
+        """Return the figures by name: displacement of the target at repeated poses, with the trend.
+
+        The mapping is empty if there are no trends.
         """
         from calib.toolkit.report_charts import AFTER, QUIET, Chart, Panel, line
 

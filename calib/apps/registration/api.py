@@ -66,9 +66,7 @@ class Placements(GeometryFit):
 
     @property
     def placed(self) -> tuple[Placed, ...]:
-        """The placed frames: each target in the arm's tip, the arm's base in each instrument, and each instrument in
-        the base.
-        """
+        """The placed frames: targets in the arm's tip, the arm's base in each instrument, each instrument in the base."""
         fit = self.selection.fit
         chain = self.robot.chain
         cell = fit.cell
@@ -93,9 +91,7 @@ class Placements(GeometryFit):
         return tuple(frames)
 
     def lines(self, *first: str) -> Iterator[str]:
-        """Yield the console lines: verdict, number of poses, residual, and the frames whose names begin with one of
-        `first`.
-        """
+        """Yield the console lines: verdict, residual, and the frames whose names begin with one of `first`."""
         poses = self.fit.poses
         yield str(self.verdict)
         for frame in self.placed:
@@ -112,8 +108,7 @@ class Placements(GeometryFit):
 
 
 def _turned(pose: np.ndarray) -> np.ndarray:
-    """Return the Jacobian (6, 6) that turns small motions along a frame's own axes to the axes of its reference frame.
-    """
+    """Return the Jacobian (6, 6) that turns small motions along a frame's own axes to the axes of its reference frame."""
     return np.kron(np.eye(2), pose[:3, :3])
 
 

@@ -66,9 +66,7 @@ class Guard:
         await responder(scope, receive, send)
 
     def _answer(self, request: Request) -> Response | None:
-        """Return the response to a request that is refused, or that sets the token's cookie; None for a request that
-        may pass.
-        """
+        """Return the response to a refused request, or to one that sets the token's cookie; None for other requests."""
         requested_host = request.headers.get("host", "")
         if not self._is_ours(requested_host):
             return PlainTextResponse("This page is not served under that name: use the address printed.", 403)
@@ -190,9 +188,7 @@ def _notes(session: Session) -> dict[str, tuple[str, ...]]:
 
 
 def _kinds(session: Session) -> list[tuple[str, str, list[str]]]:
-    """Return the kinds of files that can be uploaded to the session: name, description, and paths of the files there
-    are.
-    """
+    """Return the kinds of files that can be uploaded to the session: name, description, and paths of existing files."""
     labels = dict(step.brings for step in steps_of(session))
     if session.geometric:
         labels["drift"] = DRIFT
@@ -251,8 +247,7 @@ def view(request: Request) -> Response:
 
 
 def go_on(request: Request) -> Response:
-    """Start a run of `calib next`, or of `calib redo` if the path contains a step; ignored while a run is in progress.
-    """
+    """Start a run of `calib next`, or of `calib redo` if the path contains a step; ignored while a run is in progress."""
     work = request.app.state.work
     step = request.path_params.get("step", "")
     task = NEXT

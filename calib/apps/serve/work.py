@@ -73,9 +73,7 @@ class Work:
         self._process: Any = None
 
     def ask(self, task: str, subject: str = "") -> bool:
-        """Queue a job and return True; return False if a run is queued or in progress already, or if the job is queued
-        already.
-        """
+        """Queue a job and return True; return False if the job is queued already, or if a run is queued or in progress."""
         with self._lock:
             jobs = list(self._waiting)
             if self.current and task != CHECK:

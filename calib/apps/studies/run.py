@@ -48,9 +48,7 @@ class Progress:
 
     @property
     def remaining(self) -> float:
-        """Estimated remaining time [s], from each method's mean duration and the number of trials in parallel; NaN if
-        unknown.
-        """
+        """Estimated remaining time [s], from each method's mean duration and the number of parallel trials; or NaN."""
         if not self.spent or self.seconds <= 0:
             return float("nan")
         mean_seconds = {name: sum(seconds) / len(seconds) for name, seconds in self.spent.items()}

@@ -61,8 +61,7 @@ class RowStore:
         return key in self.rows and self.rows[key].current
 
     def append(self, rows: Sequence[TrialRow]) -> None:
-        """Append rows, written to the disk before this function returns; rows whose trial is already stored are
-        skipped.
+        """Append rows and write them to the disk before returning; rows whose trial is already stored are skipped.
 
         Raises:
             CalibError: the disk is full; earlier rows are kept, and none of these rows is.

@@ -56,8 +56,7 @@ class Calibration:
 
     @cached_property
     def rigid(self) -> tuple[Installation, np.ndarray]:
-        """The cell with the fitted geometry but without joint corrections, and the covariance (p, p) of the arm's
-        parameters.
+        """The cell without joint corrections, and the covariance (p, p) of the arm's parameters.
 
         The covariance is over the cell's whole parameter vector; it is zero for stations and tools.
         """

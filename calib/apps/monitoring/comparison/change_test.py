@@ -107,8 +107,7 @@ class ChangeTest:
 
     @property
     def rivals(self) -> tuple[str, ...]:
-        """Names of further parameters whose change alone would explain the difference about as well as the first one's.
-        """
+        """Names of further parameters whose change alone would explain the difference about as well as the first one's."""
         best = self.parameters[0].explained
         return tuple(parameter.name for parameter in self.parameters[1:] if parameter.explained > best - AS_WELL)
 
@@ -166,14 +165,16 @@ class Tested:
 def tested(
     change: np.ndarray, covariances: list[np.ndarray], spans: list[np.ndarray], columns: np.ndarray
 ) -> tuple[Tested, np.ndarray]:
-    """Return the combinations that can be compared between two estimates, and their derivatives (k, p) before
-    whitening.
+    """Return the combinations that can be compared between two estimates, and their derivatives before whitening.
 
     Args:
         change: (s,) later minus earlier values of combinations, each of a size near 1.
         covariances: (s, s) covariance of each estimate.
         spans: (s, any) orthonormal columns that span the combinations of each estimate.
         columns: (s, p) derivative of the combinations by each parameter.
+
+    Returns:
+        The k combinations, and their derivatives (k, p) by each parameter.
     """
     no_combination = np.zeros((len(change), 0))
     extra = [no_combination, no_combination]

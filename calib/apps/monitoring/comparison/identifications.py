@@ -88,9 +88,7 @@ class Identified:
 
     @property
     def keys(self) -> list[Hashable]:
-        """Keys by which each estimated parameter is matched between models: its standard name, for friction terms also
-        the form.
-        """
+        """Keys that match each estimated parameter between models: its standard name; for friction terms also the form."""
         return [_key(self.model, k) for k in self.columns]
 
 

@@ -120,9 +120,7 @@ class ToolPart(ChangePart):
         ]
 
     def _motion(self) -> list[str]:
-        """Return sentences on the target's motion: its size, the pose where it is largest, and the joint that causes
-        it.
-        """
+        """Return sentences on the target's motion: its size, the pose where it is largest, and the joint causing it."""
         change = self.change
         lines = []
         for motion in change.motions:
