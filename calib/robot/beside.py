@@ -92,7 +92,7 @@ def _is_beside(tree: UrdfTree, chain_links: set[str], joint: JointTag) -> bool:
 
 
 def _carrier(tree: UrdfTree, link: str, bodies: dict[str, int]) -> str:
-    """Return the last of the chain's moving links on the path from the root to a link; "" for a link fixed to the base."""
+    """Return the last of the chain's moving links on the path from the root to a link; "" if there is none."""
     carriers = [joint.child for joint in tree.ancestry(link) if joint.child in bodies]
     return carriers[-1] if carriers else ""
 

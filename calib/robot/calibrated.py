@@ -244,7 +244,7 @@ class CalibratedChain:
 
     @property
     def complete(self) -> Chain:
-        """Geometry with the best prediction: the one fitted with the corrections if there are any, otherwise `chain`."""
+        """Geometry with the best prediction: the one fitted with the corrections if any, otherwise `chain`."""
         return self.chain if self.corrections is None else self.corrections.chain
 
     @property
@@ -330,7 +330,10 @@ def read(path: str | Path) -> CalibratedChain:
 
 
 def read_whole(path: str | Path) -> tuple[CalibratedChain, ParsedTable]:
-    """Return the calibrated robot, as `read` does, and the extra tables of its file (`calib.robot.description.EXTRA`)."""
+    """Return the calibrated robot, as `read` does, and the extra tables of its file.
+
+    `calib.robot.description.EXTRA` names the extra tables.
+    """
     path = Path(path)
     if path.is_dir():
         path = path / ROBOT

@@ -487,7 +487,7 @@ def _lines_of(chain: Chain, q: np.ndarray, targets: np.ndarray, beside: Sequence
 
 
 def _attached_ends(chain: Chain, q: np.ndarray, beside: Sequence[Attached]) -> tuple[np.ndarray, np.ndarray]:
-    """Return start and end points (m, E, 3) [m] of the links outside the chain, in the base, at joint values q (m, n)."""
+    """Return start and end points (m, E, 3) [m] of the links outside the chain, in the base, at q (m, n)."""
     if not beside:
         return np.empty((len(q), 0, 3)), np.empty((len(q), 0, 3))
     base = np.broadcast_to(np.eye(4), (1, len(q), 4, 4))
@@ -502,7 +502,10 @@ def _attached_ends(chain: Chain, q: np.ndarray, beside: Sequence[Attached]) -> t
 
 
 def _nearest(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the positions (...), from 0 to 1, of the nearest points on the segments a to b and c to d, each (..., 3)."""
+    """Return the positions (...), from 0 to 1, of the nearest points on the segments a to b and c to d.
+
+    The ends of the segments are (..., 3).
+    """
     u, v, w = b - a, d - c, a - c
     uu = np.maximum((u * u).sum(-1), MIN_SQUARE)
     vv = np.maximum((v * v).sum(-1), MIN_SQUARE)

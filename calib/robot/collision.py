@@ -267,7 +267,7 @@ def from_urdf(
 def _add_targets(
     model: NativeModel, geometry: NativeShape, chain: Chain, targets: np.ndarray | Sequence[Sequence[float]]
 ) -> None:
-    """Attach targets (T, 3) [m] to the tip's frame, as thin capsules."""
+    """Add thin capsules from the tip to each target to `geometry`; `targets` (T, 3) are in the tip's frame [m]."""
     _, coal = _libraries()
     for number, position in enumerate(np.asarray(targets, dtype=float).reshape(-1, 3), 1):
         length = float(np.linalg.norm(position))
@@ -279,7 +279,13 @@ def _add_targets(
 
 
 def _without_inseparable(collision: Collision, margin: float, seed: int) -> Collision:
-    """Return the collision model without the pairs that touch in nearly every posture."""
+    """Return the collision model without the pairs that touch in nearly every posture.
+
+    Args:
+        collision: the model.
+        margin: the least distance that will be required [m].
+        seed: seed of the random postures.
+    """
     geometry = collision._geometry
     fixed = np.array([pair.second >= collision._links for pair in geometry.collisionPairs])
     distances = collision.distances(random_joints(collision._chain, SAMPLES, seed))
@@ -389,7 +395,7 @@ def _hull(node: Node, folders: Sequence[Path], missing: list[str], where: str) -
 
 
 def find_mesh(name: str, folders: Sequence[Path]) -> Path | None:
-    """Return the path of a mesh by its name in a URDF; None if no folder contains it."""
+    """Return the file of a mesh that a URDF names (a path, ``file://`` or ``package://``); None if it is not found."""
     if name.startswith("file://"):
         name = name.removeprefix("file://")
     variants = [name]
@@ -414,9 +420,10 @@ def package_folders() -> list[Path]:
 
 
 def meshes_beside(path: Path) -> dict[str, Path | str]:
-    """Return the mesh files of a URDF's collision shapes: path relative to the URDF's copy in ``1-robot`` to the file.
+    """Return the mesh files of a URDF's collision shapes, by the paths that they need next to a copy of the URDF.
 
-    Absolute names, and names that lead out of the URDF's folder, are left out.
+    The copy is in ``1-robot``. Meshes with absolute names, or with names that lead out of the URDF's folder, are left
+    out.
     """
     if not is_urdf(path):
         return {}

@@ -180,8 +180,7 @@ def run(
 
 
 def _stopped(session: Session, waiting: StepState) -> tuple[str, ...]:
-    """Return the engineer's instructions for the step `waiting`, and the commands that simulate this step and continue.
-    """
+    """Return the engineer's instructions for the step `waiting`, and the commands that simulate it and continue."""
     folder = session.folder
     simulate, go_on = command_line("demo", "--bring", folder), command_line("next", folder)
     return *asks(session, waiting), f"(or simulate this step: {simulate}; then: {go_on})"

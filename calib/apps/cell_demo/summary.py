@@ -128,8 +128,7 @@ class Telling:
 
 
 def reasons(session: Session) -> Iterator[str]:
-    """Yield a line for each verdict other than pass: what the verdict means, and the commands that explain its reasons.
-    """
+    """Yield a line for each verdict other than pass: its meaning, and the commands that explain its reasons."""
     reports: dict[str, ValidationMetrics | UnseenReport] = {"geometry": session.validation.metrics()}
     if session.dynamic:
         reports["dynamics"] = session.identification.unseen.read()

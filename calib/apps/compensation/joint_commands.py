@@ -155,7 +155,7 @@ def read(folder: str | Path) -> Fitted:
     """Return the calibrated arm and its cell from the folder of a fit, or of a session that contains a fit.
 
     Raises:
-        UsageError: the folder holds no fit, or an incomplete one.
+        UsageError: the folder has no fit, or an incomplete one.
     """
     result = open_result(folder, "compensate")
     fit = result.fit
@@ -335,7 +335,9 @@ def _inside(goal: Goal, q: np.ndarray) -> np.ndarray:
 
 
 def _followed(goal: Goal, poses: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return joint values (m, n) near `start` (m, n) that reach the poses; near a singularity, the motion is limited.
+    """Return joint values (m, n) near `start` (m, n) that reach the poses (m, 4, 4).
+
+    Near a singularity, the motion away from `start` is limited, and the poses may not be reached.
     """
     clipped = np.clip(start, goal.lower, goal.upper)
     q = nearest(goal, poses, clipped, reach(goal, poses, start))
@@ -370,8 +372,7 @@ def _dof(targets: Targets, chain: Chain, requested: int | None) -> tuple[int, Fi
 
 
 def _reference(goal: Goal, targets: Targets, start: Sequence[float] | None, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the poses (m, 4, 4) of the targets, and the nominal robot's joint values (m, n) [rad or m] at these poses.
-    """
+    """Return the poses (m, 4, 4) of the targets, and the nominal robot's joint values (m, n) there [rad or m]."""
     if targets.position is None:
         assert targets.q is not None
         return see(goal.cell, targets.q).poses(), np.array(targets.q)
@@ -390,7 +391,9 @@ def _reference(goal: Goal, targets: Targets, start: Sequence[float] | None, seed
 
 
 def _sought(goal: Goal, poses: np.ndarray, start: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Return the nominal robot's joint values (m, n) at the poses; of several solutions, the nearest to `start` (n,).
+    """Return the nominal robot's joint values (m, n) at the poses.
+
+    Of several solutions, the nearest to `start` (n,) is returned. The search begins at `start` and at each of `starts`.
     """
     best = np.tile(start, (len(poses), 1))
     cost = np.full(len(poses), np.inf)
@@ -482,8 +485,7 @@ def _predicted_sigmas(
 
 
 def _frame_note(fitted: Fitted, frame: str) -> Finding:
-    """Return the finding that names the targets' frame, with the distance between the ``base`` and ``nominal`` frames.
-    """
+    """Return the finding that names the targets' frame, with the distance between the frames base and nominal."""
     if frame not in ("base", "nominal"):
         return finding("targets-in-station", station=frame)
     shift = turn = None
@@ -578,7 +580,9 @@ def lines(commands: Commands) -> list[str]:
 
 
 def _expectation(commands: Commands) -> Finding:
-    """Return the finding on the real arm's expected error at these targets: by the error model, else by held-out poses.
+    """Return the finding on the real arm's expected error at these targets.
+
+    The error is that of the error model, or, without a model, the rms error at held-out poses.
     """
     reached, unseen = commands.reached, commands.fitted.unseen
     if not np.isnan(commands.expected).all():

@@ -79,7 +79,9 @@ class Configuration:
         return self.before, self.elbow, self.wrist
 
     def agrees(self, chain: Chain, q: np.ndarray) -> np.ndarray:
-        """Return whether each posture q (m, n) [rad] has the prescribed signs, (m,) bool; whole turns are not checked.
+        """Return whether each posture q (m, n) [rad] has the prescribed signs, (m,) bool.
+
+        Whole turns are not checked.
         """
         posture_signs = signs_at(chain, q, np.array(self.upright))
         required = np.array(self.signs())

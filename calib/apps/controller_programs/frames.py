@@ -278,7 +278,11 @@ def _line(chain: Chain, joint: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _off_axis(chain: Chain, pose: np.ndarray) -> float:
-    """Return the angle [rad] between the arm's last axis and the z axis of a frame with pose `pose` (4, 4) in the tip.
+    """Return the angle [rad] between the arm's last axis and the z axis of a frame.
+
+    Args:
+        chain: the arm.
+        pose: (4, 4) pose of the frame in the tip.
     """
     (tip,) = forward(chain, np.zeros((1, chain.n)))
     z = (tip @ pose)[:3, 2]

@@ -70,7 +70,9 @@ class Program:
 
     @property
     def unread(self) -> str:
-        """Warning on lines with motion statements but no target, with the first line numbers; empty if there are none.
+        """Warning on lines with motion statements but no target, with the first line numbers.
+
+        Empty if there are no such lines.
         """
         target_lines = {target.line for target in self.targets}
         move_lines = _lines_of_moves(self.text, self.controller)
@@ -119,7 +121,7 @@ class Program:
 
 
 def number(value: float, decimals: int) -> str:
-    """Return a number as text with fixed decimals, without a negative zero."""
+    """Return a number as text with `decimals` decimals, and without a minus sign before zero."""
     written = f"{value:.{decimals}f}"
     if float(written) == 0.0:
         return written.removeprefix("-")

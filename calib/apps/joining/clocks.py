@@ -153,7 +153,12 @@ class Run:
 
 @dataclass(frozen=True, eq=False)
 class _Start:
-    """Nominal arm with the placements that fit one offset of the clocks; `misfit`: rms of the smallest residuals [m].
+    """Nominal arm with the placements that fit one offset of the clocks.
+
+    Attributes:
+        misfit: rms of the smallest residuals [m].
+        clock: the clock with this offset.
+        cell: the nominal arm with placed station and tool.
     """
 
     misfit: float

@@ -341,7 +341,9 @@ def _same_names(joints: Table, points: Table, joint_column: str, point_column: s
 
 
 def _plain(text: str) -> str:
-    """Return a name in comparable form: lower-case letters and digits, without leading zeros; ``P_007`` becomes ``p7``.
+    """Return a name in comparable form: lower-case letters and digits, without leading zeros.
+
+    ``P_007`` becomes ``p7``.
     """
     plain = re.sub(r"[^a-z0-9]", "", text.lower())
     return re.sub(r"(?<!\d)0+(?=\d)", "", plain)

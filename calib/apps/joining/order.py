@@ -224,7 +224,11 @@ def _by_distances(arm: np.ndarray, points: np.ndarray, tools: Iterable[np.ndarra
 
 
 def _tool_points(arm: np.ndarray, tool: np.ndarray) -> np.ndarray:
-    """Return the positions (n, 3) of a point with coordinates `tool` (3,) in the tip's frame, for tips `arm` (n, 4, 4).
+    """Return the positions (n, 3) [m] of a point fixed to the tip.
+
+    Args:
+        arm: (n, 4, 4) poses of the tip.
+        tool: (3,) coordinates of the point in the tip's frame [m].
     """
     return arm[:, :3, 3] + arm[:, :3, :3] @ tool
 

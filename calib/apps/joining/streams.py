@@ -195,7 +195,13 @@ def _check_motion(recording: Stream, count: int, unit: str) -> None:
 
 
 def _refuse(step: Step | None, wander: float, run: Run, clock: Clock) -> NoReturn:
-    """Raise MeasurementError for recordings in which a clock steps, or wanders (`step` is None) by up to `wander` [s].
+    """Raise MeasurementError for recordings in which a clock steps or wanders.
+
+    Args:
+        step: the step; None for a clock that wanders.
+        wander: largest deviation from a line of offset and drift [s].
+        run: the recordings.
+        clock: the fitted clock.
     """
     file = run.stream.file
     if step is None:

@@ -78,7 +78,10 @@ class LogLine:
 
     @property
     def first(self) -> ParameterChange | None:
-        """The parameter whose change alone explains most since the previous line; None where no change is significant."""
+        """The parameter whose change alone explains most since the previous line.
+
+        None where no change is significant.
+        """
         if self.change is None or not self.change.changed:
             return None
         return self.change.parameters[0]
@@ -128,7 +131,7 @@ class RobotLog(ChartedResult, ReportedResult, WithoutVerdict):
         return Section("Log", [table(f"Calibrations of {self.robot}", columns, self.lines)])
 
     def charts(self) -> dict[str, Chart]:
-        """Return the figure by name: errors of each calibration, and motion of the tool since the previous calibration."""
+        """Return the figure by name: errors of each calibration, and motion of the tool between calibrations."""
         from calib.toolkit.report_charts import AFTER, BEFORE, Chart, Panel, line
 
         errors = []
@@ -236,7 +239,10 @@ def log(folders: Sequence[str | Path], *, mixed: bool = False) -> RobotLog:
 
 
 def _check_same(attribute: str, names: Sequence[str], mixed: bool) -> None:
-    """Raise UsageError if sessions have different names (or serial numbers), unless `mixed`; empty names are ignored."""
+    """Raise UsageError if sessions have different names (or serial numbers), unless `mixed`.
+
+    Empty names are ignored.
+    """
     different = list(dict.fromkeys(name for name in names if name))
     message = f"the sessions have different {attribute} ({', '.join(different)}); --mixed takes them for one robot"
     require(len(different) < 2 or mixed, message, UsageError)

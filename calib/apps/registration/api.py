@@ -66,7 +66,10 @@ class Placements(GeometryFit):
 
     @property
     def placed(self) -> tuple[Placed, ...]:
-        """The placed frames: targets in the arm's tip, the arm's base in each instrument, each instrument in the base."""
+        """The placed frames.
+
+        They are each target in the arm's tip, the arm's base in each instrument, and each instrument in the arm's base.
+        """
         fit = self.selection.fit
         chain = self.robot.chain
         cell = fit.cell
@@ -108,7 +111,7 @@ class Placements(GeometryFit):
 
 
 def _turned(pose: np.ndarray) -> np.ndarray:
-    """Return the Jacobian (6, 6) that turns small motions along a frame's own axes to the axes of its reference frame."""
+    """Return the Jacobian (6, 6) of small motions along the reference axes by those along a frame's own axes."""
     return np.kron(np.eye(2), pose[:3, :3])
 
 

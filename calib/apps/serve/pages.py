@@ -247,7 +247,10 @@ def view(request: Request) -> Response:
 
 
 def go_on(request: Request) -> Response:
-    """Start a run of `calib next`, or of `calib redo` if the path contains a step; ignored while a run is in progress."""
+    """Start a run of `calib next`, or of `calib redo` if the path contains a step.
+
+    The request is ignored while a run is in progress.
+    """
     work = request.app.state.work
     step = request.path_params.get("step", "")
     task = NEXT

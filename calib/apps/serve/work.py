@@ -73,7 +73,10 @@ class Work:
         self._process: Any = None
 
     def ask(self, task: str, subject: str = "") -> bool:
-        """Queue a job and return True; return False if the job is queued already, or if a run is queued or in progress."""
+        """Queue a job and return whether it was queued.
+
+        It is not if it is already queued, or if it is a run and another run is queued or in progress.
+        """
         with self._lock:
             jobs = list(self._waiting)
             if self.current and task != CHECK:

@@ -239,8 +239,7 @@ def _check_cutoffs(conditions: Sequence[Condition]) -> None:
 
 
 def _paths(files: Sequence[str | Path]) -> list[Path]:
-    """Return the paths of study files without repetition, from paths, names of shipped studies, and patterns of names.
-    """
+    """Return the paths of study files, each once, from paths, names of shipped studies, and patterns of names."""
     library = shipped()
     paths: list[Path] = []
     for text in map(str, files):

@@ -91,7 +91,11 @@ class ComparedMethod:
 
 @dataclass(frozen=True, eq=False)
 class _Sums:
-    """Sums over blocks of time, each (k, rows): squared errors and squared torques, in the identification band and raw.
+    """Sums over blocks of time, each (k, rows), of squared errors and squared torques.
+
+    Attributes:
+        error, size: errors and torques in the identification band.
+        raw_error, raw_size: errors and torques as recorded.
     """
 
     error: np.ndarray

@@ -101,7 +101,7 @@ class MethodSummary:
 
 @dataclass(frozen=True)
 class ConditionSummary:
-    """Summaries of all methods on one condition, best first."""
+    """Summaries of all methods on one condition, in order of rank (best first)."""
 
     condition: Condition
     methods: tuple[MethodSummary, ...]

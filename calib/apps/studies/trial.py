@@ -97,8 +97,7 @@ class TrialRow:
 
     @property
     def current(self) -> bool:
-        """Whether the method is unchanged since the trial; otherwise the row is not used, and the trial is run again.
-        """
+        """Whether the method is unchanged since the trial; otherwise the row is not used and the trial is repeated."""
         return (self.version.partition(_CHANGED)[2] or "1") == str(VERSIONS.get(self.method, 1))
 
     @property

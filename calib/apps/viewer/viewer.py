@@ -198,7 +198,9 @@ def _poses(name: str, count: int, start: float, selection: np.ndarray | None = N
 
 
 def _measured(recording: RecordingStream, scene: Scene, measured: Measured, start: float) -> float:
-    """Log measured points and error arrows, all together and pose by pose; return the start time of the next part [s].
+    """Log measured points and error arrows, all together and pose by pose.
+
+    Returns the start time of the next part [s].
     """
     if not len(measured.q) or scene.chain is None:
         return start
@@ -239,7 +241,9 @@ def _measured(recording: RecordingStream, scene: Scene, measured: Measured, star
 
 
 def _sizes(recording: RecordingStream, scene: Scene, sizes: ErrorSizes, start: float) -> float:
-    """Log the sizes of errors row by row, with the arm at each row's pose; return the start time of the next part [s].
+    """Log the sizes of errors row by row, with the arm at each row's pose.
+
+    Returns the start time of the next part [s].
     """
     count = len(sizes.q)
     entity = f"errors/{sizes.kind}"

@@ -202,7 +202,12 @@ class Sheet:
         return families[0] if families else ()
 
     def _mapped(self, name: str, together: Sequence[str]) -> str:
-        """Return the file's name of the column `name`, one of the family `together` that the options map only in part."""
+        """Return the file's name of the column `name` in a family that the options map only in part.
+
+        Args:
+            name: the toolkit's name of the column.
+            together: the toolkit's names of all columns of the family.
+        """
         if name in self.options.columns:
             return self.options.columns[name]
         candidates = [name + suffix for suffix in self.suffixes if name + suffix in self.table]

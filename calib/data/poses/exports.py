@@ -91,7 +91,10 @@ def presets() -> dict[str, dict[str, str]]:
 
 
 def translated(path: str | Path) -> InstrumentExport | None:
-    """Return an instrument's file as the text of a CSV table; None if it is a CSV table already, or has no positions."""
+    """Return an instrument's file as the text of a CSV table.
+
+    None if the file is a CSV table already, or has no positions.
+    """
     with open(path, "rb") as file:
         beginning = file.read(HEAD)
         is_utf16 = beginning[:2] in (b"\xff\xfe", b"\xfe\xff")

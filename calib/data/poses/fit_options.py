@@ -160,7 +160,7 @@ class FitOptions(FileOptions):
     source: Annotated[str, Hidden()] = ""
 
     def for_file(self, path: str | Path) -> FileOptions:
-        """Return the options for the file at `path`: its table under [files] if there is one, else the common options."""
+        """Return the options for the file at `path`: its table under [files] if there is one, else the common ones."""
         return own_table(self.files, path) or self
 
 

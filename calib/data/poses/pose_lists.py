@@ -82,7 +82,7 @@ def write_poses(path: str | Path, q: ArrayLike, joint_names: Sequence[str], kind
 
 
 def joint_columns(names: Sequence[str], kinds: Sequence[str]) -> tuple[list[str], np.ndarray]:
-    """Return the headers of joint columns, ``joint1 [deg]`` or ``[mm]``, and the factors (n,) from SI to these units."""
+    """Return the headers of joint columns, ``joint1 [deg]`` or ``[mm]``, and the factors (n,) from SI to the units."""
     headers = []
     factors = []
     for name, kind in zip(names, kinds):

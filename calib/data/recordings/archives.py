@@ -58,7 +58,7 @@ def read_archive(path: Path, joints: Joints | None, options: RecordingOptions, e
 
 
 def read_archived_positions(path: Path, joints: Joints, options: RecordingOptions) -> tuple[np.ndarray, np.ndarray]:
-    """Return the time stamps (N,) [s] and reference positions (N, n) in an archive: q_ref, or q if there is no q_ref."""
+    """Return the time stamps (N,) [s] and reference positions (N, n) in an archive: q_ref, or q without q_ref."""
     with _opened(path) as archive:
         names = find_names(tuple(archive.members), options, path)
         series = "q_ref" if "q_ref" in names else "q"

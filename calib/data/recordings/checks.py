@@ -255,7 +255,10 @@ def _check_time(recording: Recording) -> None:
 
 
 def _check_size(recording: Recording, joints: Joints | None = None) -> None:
-    """Raise MeasurementError for positions that no joint can reach: degrees, millimetres, or columns of another robot."""
+    """Raise MeasurementError for positions that no joint can reach.
+
+    Likely causes are degrees, millimetres, or columns of another robot.
+    """
     kinds = joints.kinds if joints else ("revolute",) * recording.n
     max_size = max_travel(kinds)
     if joints is not None:

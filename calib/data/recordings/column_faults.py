@@ -1,7 +1,7 @@
-"""Columns of a recording that stand while what they measure moves: clipped torques and frozen encoders.
+"""Columns of a recording that are constant although the measured quantity changes: clipped torques, frozen encoders.
 
-Said only where columns contradict each other as recorded: a value that is exactly repeated is no measurement of
-something that changes. A joint that stands, and a torque whose largest values differ, are sound.
+A fault is reported only where columns contradict each other. A value that is repeated exactly is no measurement of a
+changing quantity. A joint at rest is no fault, and neither is a torque whose largest values differ.
 """
 
 from collections.abc import Iterator
@@ -172,7 +172,10 @@ def _resolution(values: np.ndarray) -> float:
 
 
 def _moved(t: np.ndarray, v: np.ndarray) -> float:
-    """Return the range of the integral of velocities v (N,) [rad or m]; gaps in the time stamps count as short steps."""
+    """Return the range of the integral of velocities v (N,) [rad or m].
+
+    Gaps in the time stamps count as short steps.
+    """
     step = np.diff(t)
     step = np.minimum(step, 3.0 * np.median(step))
     mean_velocity = 0.5 * (v[1:] + v[:-1])

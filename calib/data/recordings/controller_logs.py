@@ -71,7 +71,7 @@ def translated(path: str | Path) -> Log | None:
 
 
 def _form(head: str) -> ParsedTable | None:
-    """Return the table in ``logs.toml`` of the known log whose files have the first line `head`; None for another file."""
+    """Return the table in ``logs.toml`` of the known log whose files have the first line `head`; or None."""
     for form in logs().values():
         if re.search(form["header"], head):
             return form

@@ -144,7 +144,11 @@ class Recording:
         return self.take(rows_of_cut(self.t, start, stop, self.file))
 
     def take(self, index: slice | np.ndarray) -> Recording:
-        """Return the recording of the samples at `index` (a slice, indices, or a mask (N,)), with their times and rows."""
+        """Return the recording of the samples at `index`, with their times and row numbers.
+
+        Args:
+            index: a slice, indices, or a mask (N,).
+        """
         series: dict[str, object] = {}
         for name in SERIES:
             values = getattr(self, name)
@@ -203,7 +207,10 @@ def in_pieces(recording: Recording, max_samples: int | None) -> Recording:
 
 
 def settled(values: np.ndarray) -> np.ndarray:
-    """Return `values` itself if it is a read-only float array, else a read-only copy; this avoids copies of large logs."""
+    """Return `values` itself if it is a read-only float array, else a read-only copy.
+
+    This avoids copies of large logs.
+    """
     owner = values
     if isinstance(values, np.ndarray) and values.base is not None:
         owner = values.base

@@ -146,7 +146,7 @@ def _stamp_column(table: Table, names: Sequence[str]) -> list[int]:
 
 
 def _joint_columns(table: Table, stems: Sequence[str], joints: Sequence[str]) -> list[int]:
-    """Return the column indices of the first quantity in `stems` that the table has for all joints; [] if it has none."""
+    """Return the column indices of the first quantity in `stems` that the table has for all joints; else []."""
     for stem in stems:
         columns = _of_joints(table, stem, joints) or _numbered(table, stem)
         if columns:
@@ -155,7 +155,7 @@ def _joint_columns(table: Table, stems: Sequence[str], joints: Sequence[str]) ->
 
 
 def _of_joints(table: Table, stem: str, joints: Sequence[str]) -> list[int]:
-    """Return the indices of the columns whose names consist of the quantity `stem` and a joint's name; [] without them."""
+    """Return the indices of the columns whose names consist of the quantity `stem` and a joint's name; else []."""
     header, stem = [name.lower() for name in table.header], stem.lower()
     for pattern in (f"{stem}_{{}}", f"{stem}{{}}", f"{stem} {{}}", f"{{}}_{stem}", f"{{}}.{stem}", f"{stem}.{{}}"):
         columns = [pattern.format(joint.lower()) for joint in joints]

@@ -1,8 +1,8 @@
-"""Rows whose stamps run backwards by a few steps are put in order; rows of two joined logs, or of a set clock, are not.
+"""Rows whose time stamps run backwards by a few steps are sorted; larger steps backwards are not.
 
-Rows written in another order than they were sampled (several threads or sockets) look like rows in the right order with
-stamps that jitter by more than a step. Positions distinguish the two: of two orders of the same samples, the right one
-gives the shorter path.
+Larger steps come from two joined logs, or from a clock that was set. Rows that were written in another order than they
+were sampled (several threads or sockets) look like rows in the right order whose stamps jitter by more than a step.
+Positions distinguish the two cases: of two orders of the same samples, the right one gives the shorter path.
 """
 
 from dataclasses import replace

@@ -81,7 +81,10 @@ def design_decimator(rate: float, factor: int, kind: str = "kaiser") -> Decimato
 
 
 def factor_for(rate: float, band: float) -> int:
-    """Return the largest decimation factor n_d whose filter passes `band` [Hz]: floor(0.8 rate / (2 f_p)), at least 1."""
+    """Return the largest decimation factor n_d whose filter passes `band` f_p [Hz], at least 1.
+
+    n_d = floor(0.8 rate / (2 f_p))
+    """
     return max(1, int(SHARE * rate / (2 * band) + 1e-9))
 
 

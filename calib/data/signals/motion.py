@@ -377,7 +377,11 @@ def _differences(
 
 
 def _unaffected(sampled: Resampled, cutoff: np.ndarray, options: FilterOptions, file: str) -> np.ndarray:
-    """Return the samples that the ends of the filters do not affect, (N,) bool; refuse a motion without such samples."""
+    """Return the samples that the ends of the filters do not affect, (N,) bool.
+
+    Raises:
+        MeasurementError: there are no such samples.
+    """
     if options.borders is None:
         border = filtering.border(sampled.rate, float(cutoff.min()))
         reason = "the filters' ends"

@@ -119,7 +119,7 @@ def _moving_states(motion: Motion, max_states: int) -> np.ndarray:
 
 
 def _best_sine(q: np.ndarray, rate: float) -> tuple[float, float]:
-    """Return the largest share of the variance of a series (N,) that one sine explains, and the sine's frequency [Hz]."""
+    """Return the largest share of the variance of a series (N,) that one sine explains, and its frequency [Hz]."""
     window = np.hanning(len(q) + 1)[:-1]
     size = int(next_fast_len(4 * len(q), real=True) or 0)
     power = np.abs(np.fft.rfft(window * (q - window @ q / window.sum()), size)) ** 2

@@ -113,7 +113,7 @@ class _Axes:
         return sum(joint.actuated for joint in self.tree.path(self.base, link))
 
     def height(self, joint: JointTag) -> int:
-        """Return the number of axes on the longest chain that begins with a joint; 0 for a joint that is not an axis."""
+        """Return the number of axes on the longest chain that begins with a joint; 0 if the joint is not an axis."""
         if joint.name in self.aside:
             return 0
         behind = [self.height(child) for child in self.tree.below[joint.child]]
@@ -287,7 +287,10 @@ class _Axes:
         return result
 
     def _is_tool(self, body: str, branches: list[JointTag]) -> bool:
-        """Return whether the joints that depart from a body with a flange belong to a tool: single joints, or a hand."""
+        """Return whether the joints that depart from a body with a flange belong to a tool.
+
+        A tool has single joints, or is a hand.
+        """
         if any(self._in_series(joint) or self._is_named_axis(joint) for joint in branches):
             return False
         heights = [self.height(joint) for joint in branches]
@@ -367,7 +370,7 @@ class _Axes:
         return bool((AXIS_WORDS & _words(joint.name)) - _words(self._first(joint.child)))
 
     def _in_series(self, joint: JointTag) -> bool:
-        """Return whether a joint's name continues that of the actuated joint before it with the next number or letter."""
+        """Return whether a joint's name is that of the actuated joint before it, with the next number or letter."""
         before = [earlier for earlier in self.tree.ancestry(joint.child)[:-1] if earlier.actuated]
         return bool(before) and _follows(before[-1].name, joint.name)
 
@@ -406,7 +409,10 @@ def _frame(tree: UrdfTree, body: str) -> tuple[str, str]:
 
 
 def _without_tools(tree: UrdfTree, body: str) -> list[str]:
-    """Return the links fixed to a body, except grippers, sensors and links on these; the body's main link is the first."""
+    """Return the links fixed to a body, except grippers, sensors and links on these.
+
+    The first one is the body's main link.
+    """
     prefix = body.lower()
     result: list[str] = []
     todo = [body]

@@ -169,7 +169,10 @@ def _elements(
 
 
 def drive(tree: UrdfTree, joint: JointTag) -> tuple[str, float, float]:
-    """Return the name of the actuated joint that moves `joint`, with ratio and offset, through chains of mimic joints."""
+    """Return the name of the actuated joint that moves `joint`, and ratio and offset of this motion.
+
+    Chains of mimic joints are followed.
+    """
     ratio, offset, name = 1.0, 0.0, joint.name
     where = f"{tree.where}, line {joint.node.line}, joint '{joint.name}'"
     passed = {name}

@@ -71,7 +71,7 @@ def load_calibrated(robot: str | Path, base: str | None = None, tip: str | None 
 
 
 def resolve(robot: str | Path) -> Path:
-    """Return the file of a robot given by name or path; a file in the working folder takes precedence over the library."""
+    """Return the file of a robot given by name or path; files in the working folder precede the library."""
     location = Path(robot)
     library = names()
     require(str(robot).strip(), f"the robot's name is empty; the library has {', '.join(library)}", RobotError)

@@ -67,7 +67,7 @@ class ChangePart(ABC):
 
     @abstractmethod
     def charts(self) -> dict[str, Chart]:
-        """Return the figures, by name."""
+        """Return the figures of this part, by name."""
 
     @abstractmethod
     def shown(self, value: float) -> str:
@@ -79,7 +79,7 @@ class ChangePart(ABC):
 
     @cached_property
     def noticed(self) -> tuple[Finding, ...]:
-        """Findings, worst first."""
+        """All findings on this part, worst first."""
         return settle([*self.specific_findings(), *self._shared_findings()])
 
     @cached_property

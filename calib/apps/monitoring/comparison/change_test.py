@@ -107,7 +107,7 @@ class ChangeTest:
 
     @property
     def rivals(self) -> tuple[str, ...]:
-        """Names of further parameters whose change alone would explain the difference about as well as the first one's."""
+        """Names of further parameters whose change alone would explain the difference about as well as the first's."""
         best = self.parameters[0].explained
         return tuple(parameter.name for parameter in self.parameters[1:] if parameter.explained > best - AS_WELL)
 

@@ -88,7 +88,10 @@ class Identified:
 
     @property
     def keys(self) -> list[Hashable]:
-        """Keys that match each estimated parameter between models: its standard name; for friction terms also the form."""
+        """Keys that match each estimated parameter between models.
+
+        The key is the standard name of the parameter; for friction terms it also contains the form of the term.
+        """
         return [_key(self.model, k) for k in self.columns]
 
 

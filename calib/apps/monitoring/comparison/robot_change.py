@@ -65,7 +65,7 @@ class RobotChange(ChartedResult, ReportedResult):
 
     @property
     def noticed(self) -> tuple[Finding, ...]:
-        """The findings of all parts."""
+        """Findings on all parts of the comparison."""
         findings: list[Finding] = []
         for part in self.parts:
             findings += part.noticed

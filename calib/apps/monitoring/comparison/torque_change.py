@@ -81,7 +81,9 @@ class DynamicsChange(ChangeTest):
 
     @property
     def part(self) -> PartChange | None:
-        """The first part, if its change alone explains the difference up to chance, or `NEARLY_ALL` of χ²; else None.
+        """The first of `parts`, if its change alone explains the difference; else None.
+
+        It does if the remaining χ² may be chance, or if it explains the share `NEARLY_ALL` of χ².
         """
         first = self.parts[0]
         if self.suffices(first.explained, first.count) or first.explained > NEARLY_ALL * self.chi2:
