@@ -28,7 +28,8 @@ class JointCommands(Shown, joint_commands.Commands):
     def save(self, path: str | Path, *, partial: bool = False, overwrite: bool = False) -> Path:
         """Write the joint commands as CSV and return its path; with `partial`, also where some targets are not reached.
 
-        With `overwrite`, a file at `path` is replaced that no earlier run of calib wrote, or that was edited since.
+        An existing file that no earlier run of calib wrote, or that was edited since, is replaced only with
+        `overwrite`.
         """
         with files.results([(Path(path), (".csv",))], overwrite=overwrite):
             return joint_commands.write(self, Path(path), partial)

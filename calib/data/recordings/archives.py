@@ -266,7 +266,7 @@ def _used(archive: _Archive, t: np.ndarray, options: RecordingOptions, ends: End
     """Return the indices of the rows to read, and notes.
 
     These are the rows within `ends` if given, otherwise within the archive's ``use_range`` if it has one, otherwise
-    all.
+    all. If there are more than `options.samples`, pieces spread over them are read.
     """
     use_range = None
     if options.use_range and ends == (None, None):
