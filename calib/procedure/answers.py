@@ -92,7 +92,8 @@ class Answers:
         obstacles: 'table box 1.2,0.8,0.05 at 0.7,0,-0.03' [m]: shape, size, centre; unknown, or none; repeatable.
         dynamics: identify the dynamics, too (default), or fit the geometry only.
         torques: which torques the log contains.
-        payloads: label=kg of a payload for additional recordings; repeatable.
+        payloads: label=kg of a payload for additional recordings, or 'label=kg at x,y,z' with its centre of mass in
+            the tip's frame [m]; label alone if its mass is unknown; repeatable (in an answer: between semicolons).
         tolerance_mm: largest accepted rms of the position on unseen poses [mm]; 0: none.
         tolerance_percent: largest accepted torque error of the exported robot on unseen motion [%]; 0: none.
         program: controller in whose language the poses are written, too: ur, krl … (calib program --list); or none.

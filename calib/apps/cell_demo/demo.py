@@ -3,6 +3,7 @@
 import resource
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,6 +25,7 @@ from calib.toolkit.sessions import (
     MARK,
     ROUND,
     WAITING,
+    Payload,
     Say,
     Session,
     StepState,
@@ -34,6 +36,7 @@ from calib.toolkit.sessions import (
     next_round,
     open_session,
     run_next,
+    stated_payloads,
     step_states,
 )
 from calib.toolkit.simulations import (
@@ -42,6 +45,7 @@ from calib.toolkit.simulations import (
     CameraCell,
     Cell,
     MovingArm,
+    carrying,
     limits_of,
     measure,
     moving_arm,
@@ -74,8 +78,10 @@ SIMULATED = "simulated cell: {note}; nothing was measured on a robot"
 TRAINING = "training"
 # seeds of their noise, how long the arm ran before [s]
 LOGS = ((TRAINING, 2, 240.0), ("validation", 3, 480.0))
-# how long the arm ran before the logs of further rounds [s]
-ROUND_RUNNING = 720.0
+# how long the arm ran before the logs of further rounds, and between logs without and with a payload [s]
+ROUND_RUNNING, PAYLOAD_RUNNING = 720.0, 60.0
+# true payload where mass or centre of mass are not stated: mass [kg], centre of mass in the tip's frame [m]
+PAYLOAD = Payload(2.0, (0.01, 0.02, 0.07))
 
 
 @dataclass(frozen=True)
@@ -112,6 +118,7 @@ def run(
     guided: bool = False,
     plots: bool = True,
     instrument: str = "cmm",
+    payloads: Sequence[str] = (),
     verbose: bool = False,
 ) -> DemoResult:
     """Run a session on a simulated robot, compare the calibrated robot with the hidden truth, and return the result.
@@ -125,6 +132,7 @@ def run(
         guided: stop where an engineer has to act; `simulate_next` then simulates that step.
         plots: whether figures are drawn.
         instrument: ``cmm``, or ``camera``, for which images of a board are rendered.
+        payloads: bodies at the flange, with which the motions are played again, as of ``calib new --payload``.
         verbose: print the session's messages too.
 
     Raises:
@@ -132,6 +140,8 @@ def run(
     """
     if instrument not in ("cmm", "camera"):
         raise UsageError(f"--instrument {instrument}: expected cmm or camera")
+    if payloads and not dynamics:
+        raise UsageError("--payload applies to the dynamics, which --geometry-only excludes")
     started = time.perf_counter()
     cell = virtual_cell(robot, seed)
     if dynamics and cell.nominal.inertias is None:
@@ -141,7 +151,7 @@ def run(
     motion: dict[str, Any] = {}
     if dynamics:
         torques = "both" if sensed(robot) else "motor"
-        motion = MOTION | {"torques": torques}
+        motion = MOTION | {"torques": torques, "payloads": stated_payloads(payloads)}
     begin = partial(
         new_session, folder, robot, instrument, poses=FIT, validation=VALIDATION, seed=seed, dynamics=dynamics, **motion
     )
@@ -207,7 +217,8 @@ def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, 
         # friction in the middle of the motion that was fitted
         motion = designed_motions(session)[TRAINING]
         running = LOGS[0][2] + REST + motion.period * motion.repeat / 2.0
-        true = true_base(dynamics.model, cell, arm, session.settings.seed, running)
+        payloads = {label: payload.parameters or () for label, payload in _true_payloads(session).items()}
+        true = true_base(dynamics.model, cell, arm, session.settings.seed, running, payloads)
         within, count = share_within(true, read_estimate(session.identification.path))
         truth["torque_percent"] = torques.identified
         truth["within_two_sigma"] = within
@@ -282,7 +293,8 @@ def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda tex
         say("    (the simulated cell measures both lists of poses)")
     elif step in ("record", "predict"):
         simulate_recordings(session, arm_of(session, cell), seed)
-        say("    (the simulated arm plays both motions)")
+        loads = ", without and with each payload" if session.settings.dynamics.payloads else ""
+        say(f"    (the simulated arm plays both motions{loads})")
     else:
         raise SessionError(f"the demonstration cannot simulate the files that step {step} needs")
 
@@ -318,9 +330,23 @@ def _mark(session: Session, note: str) -> None:
     files.write(path, "\n".join(marks) + "\n")
 
 
+def _true_payloads(session: Session) -> dict[str, Payload]:
+    """Return the session's payloads by label; an unstated mass or centre of mass is that of `PAYLOAD`."""
+    payloads = {}
+    for label, payload in session.settings.dynamics.payloads.items():
+        mass = PAYLOAD.mass if payload.mass is None else payload.mass
+        payloads[label] = Payload(mass, payload.com or PAYLOAD.com)
+    return payloads
+
+
 def simulate_recordings(session: Session, arm: MovingArm, seed: int) -> None:
-    """Simulate torque recordings of the designed motions, and write them into the session's folder."""
-    _mark(session, arm.note)
+    """Simulate torque recordings of the designed motions, without and with each payload.
+
+    They are written into the session's folder.
+    """
+    payloads = _true_payloads(session)
+    payload_notes = [f"; payload '{label}': {payload}" for label, payload in payloads.items()]
+    _mark(session, arm.note + "".join(payload_notes))
     motions = designed_motions(session)
     logs = list(LOGS)
     for name in motions:
@@ -336,3 +362,8 @@ def simulate_recordings(session: Session, arm: MovingArm, seed: int) -> None:
         noise = np.random.default_rng([seed, noise_seed])
         recorded = record(arm, reference, noise, running)
         write_log(recorded, session.path(f"7-recorded/{name}_log.csv"))
+        for number, (label, payload) in enumerate(payloads.items(), 1):
+            loaded = carrying(arm, payload.parameters or ())
+            noise = np.random.default_rng([seed, noise_seed, number])
+            recorded = record(loaded, reference, noise, running + number * PAYLOAD_RUNNING)
+            write_log(recorded, session.path(f"7-recorded/{name}_{label}_log.csv"))

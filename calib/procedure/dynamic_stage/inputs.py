@@ -399,8 +399,9 @@ def _check_files(options: IdentifyOptions, paths: Sequence[str]) -> None:
     """Refuse a [files] table that names none of the recordings."""
     files = [Path(parse_cut(str(path))[0]) for path in paths]
     file_names = [file.name for file in files]
+    source = f"{options.source}: " if options.source else ""
     for name in options.files:
         parts = Path(name).parts
         if not any(file.parts[-len(parts) :] == parts for file in files):
-            message = f'{options.source}: files."{name}" names none of the recordings{suggestion(name, file_names)}'
+            message = f'{source}files."{name}" names none of the recordings{suggestion(name, file_names)}'
             raise UsageError(f"{message}: {', '.join(file_names)}")

@@ -29,6 +29,8 @@ MOVES = 0.1
 BEND = 1e-4
 # sigmas below zero from which on a drive's inertia or friction is called negative
 SURELY = 2.0
+# sigmas from which on a payload's identified mass differs from zero, or from its stated mass (our choice)
+SURELY_ABSENT = 3.0
 # neighbouring rows that count as one from which on a residual is unmodelled dynamics, not noise
 MAX_CORRELATED_ROWS = 3.0
 # of all training files together [s] (our choice)
@@ -238,6 +240,7 @@ def parameter_findings(identification: Identification[RegressorModel]) -> tuple[
     if identification.fitted.held is not None:
         findings += identification.fitted.held.findings
     findings += _negative(identification)
+    findings += settle(_payload_masses(identification))
     rests = resting_parameters(identification)
     if rests.names:
         count = len(rests.names)
@@ -277,6 +280,23 @@ def _negative(identification: Identification[RegressorModel]) -> list[Finding]:
         if term is not None and term.nonnegative and value < -SURELY * sigma:
             names.append(f"{name} = {value:.3g} ± {sigma:.2g}")
     return [finding("negative-drives", names=names)] if names else []
+
+
+def _payload_masses(identification: Identification[RegressorModel]) -> Iterable[Finding]:
+    """Yield findings on payloads whose identified mass is not positive, or not the stated one."""
+    estimate = identification.fitted.estimate
+    masses = dict(zip(identification.base.names, zip(estimate.values, estimate.sigma)))
+    for label, payload in identification.settings.payloads.items():
+        if f"M{label}" not in masses:
+            continue
+        mass, sigma = masses[f"M{label}"]
+        if mass < -SURELY_ABSENT * sigma:
+            yield finding("payload-exchanged", label=label, mass=mass, sigma=sigma)
+        elif mass < SURELY_ABSENT * sigma:
+            yield finding("payload-absent", label=label, mass=mass, sigma=sigma)
+        elif payload.mass is not None and abs(mass - payload.mass) > SURELY_ABSENT * sigma:
+            off = abs(mass - payload.mass) / payload.mass
+            yield finding("payload-mass", label=label, mass=mass, sigma=sigma, stated=payload.mass, off=off)
 
 
 def _unmodelled(identification: Identification) -> list[Finding]:

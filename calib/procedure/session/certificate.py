@@ -206,7 +206,7 @@ def _setup(session: Session, metrics: FitMetrics | None) -> list[Entry]:
         allowed = "none given: pass below 10 %"
         if section.tolerance_percent:
             allowed = f"{section.tolerance_percent:g} % on unseen motion"
-        payloads = ", ".join(f"{label} {mass:g} kg" for label, mass in section.payloads.items())
+        payloads = ", ".join(f"{label} {payload}" for label, payload in section.payloads.items())
         rows += [
             ("recordings", _names(session.brought("training", "unseen"))),
             ("torques", TORQUES[section.torques]),

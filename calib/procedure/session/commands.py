@@ -28,6 +28,7 @@ from calib.procedure.measuring.pose_limits import read_limits, tables_of
 from calib.procedure.report import page
 from calib.procedure.robot_kinds import stage_of
 from calib.procedure.session import steps
+from calib.procedure.session.dynamics_steps import unrecorded_payloads
 from calib.procedure.session.folder import POSES, UNSEEN, WAYS, Say, Session, create, locked, open_session, read_state
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.questions import instrument_named
@@ -134,13 +135,14 @@ def _to_record(session: Session, step: str) -> tuple[str, str]:
     """Return which motions to play, and the logs to provide."""
     section, joints = session.settings.dynamics, chain_of(session).joints
     names = []
-    if step == "record" and not session.brought("training"):
+    missing = unrecorded_payloads(session) if step == "record" else []
+    if step == "record" and (missing or not session.brought("training")):
         names.append("training")
     if section.validation and not session.brought("unseen"):
         names.append("validation")
 
     if section.plan:
-        task = _to_play(session, names, step == "record")
+        task = _to_play(session, names, missing)
     else:
         task = "Record two motions of all joints: one for training, and a different one for validation."
     first, last = joints[0], joints[-1]
@@ -150,15 +152,20 @@ def _to_record(session: Session, step: str) -> tuple[str, str]:
         columns.append(f"tau_{first.name} [{torque}] to tau_{last.name} [{last_torque}]")
     if section.torques != "motor":
         columns.append(f"tau_link_{first.name} to tau_link_{last.name} (the sensors')")
-    files = " and ".join(str(session.path(f"7-recorded/{name}_log.csv")) for name in names)
+    logs = []
+    for name in names:
+        if name == "validation" or not session.brought("training"):
+            logs.append(f"{name}_log.csv")
+        logs += [f"{name}_{label}_log.csv" for label in missing]
+    files = " and ".join(str(session.path(f"7-recorded/{log}")) for log in logs)
     return task, (
         f"{files}, one row per sample: t [s], {', '.join(columns)}; currents are i_{first.name} [A] …; .npz and ROS "
         "bags work, too (calib formats recordings)"
     )
 
 
-def _to_play(session: Session, names: Sequence[str], with_payloads: bool) -> str:
-    """Return how to play the designed motions of these names, and again with each payload."""
+def _to_play(session: Session, names: Sequence[str], payloads: Sequence[str]) -> str:
+    """Return how to play the designed motions of these names, and again with each payload of these labels."""
     section = session.settings.dynamics
     file = RUN if section.repeats > 1 else SAMPLES
     motions = " and, into a separate file, ".join(str(session.path(f"6-excitation/{name}/{file}")) for name in names)
@@ -169,9 +176,10 @@ def _to_play(session: Session, names: Sequence[str], with_payloads: bool) -> str
         "first row.",
         "Log joint positions and torques all the time.",
     ]
-    if section.payloads and with_payloads:
-        loads = ", ".join(f"'{label}' ({mass:g} kg)" for label, mass in section.payloads.items())
-        parts.append(f"Then repeat it with {loads} on the flange, and put the label into the file's name.")
+    if payloads:
+        loads = " and ".join(f"'{label}' ({section.payloads[label]})" for label in payloads)
+        motions_again = "both" if len(names) > 1 else "it"
+        parts.append(f"Repeat {motions_again} with {loads} on the flange, into files with the label in their names.")
     return _numbered(*parts)
 
 

@@ -3,7 +3,8 @@
 The same functions as `calib excite` and `calib identify`; only the files are the session's.
 """
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 
 from calib import files
 from calib.column_changes import Change
-from calib.data.recordings.recording import Recording
+from calib.data.recordings.recording import Recording, parse_cut
 from calib.data.recordings.recording_files import read_recording
 from calib.dynamics.torque_rows import torque_rows
 from calib.errors import CalibError, Finding, finding, refuse_data
@@ -26,7 +27,6 @@ from calib.identification.checks.recorded_motion import (
     share_of_nominal,
 )
 from calib.identification.identify_options import FileSettings, IdentifyOptions, read_options
-from calib.identification.settings import Payload
 from calib.procedure.dynamic_stage import identify as identifying
 from calib.procedure.dynamic_stage import inputs
 from calib.procedure.dynamic_stage.identify import DynamicsAssessment, assess
@@ -64,16 +64,39 @@ def options_of(session: Session) -> IdentifyOptions:
     if not section.options:
         rows = torque_rows(section.torques)
         settings = replace(settings, torque_rows=rows, friction=section.friction, method=section.method)
-    payloads = {label: Payload(float(mass)) for label, mass in section.payloads.items()}
-    settings = replace(settings, payloads=payloads | dict(settings.payloads), seed=session.settings.seed)
-    # a recording carries the payloads whose labels are in its name
+    payloads = dict(section.payloads) | dict(settings.payloads)
+    settings = replace(settings, payloads=payloads, seed=session.settings.seed)
     by_file = dict(options.files)
     for path in session.brought("training", "unseen"):
-        labels = tuple(label for label in payloads if label.lower() in path.stem.lower())
+        labels = _labels_in(path.stem, payloads)
         if labels:
             default = FileSettings(options.every.recording, options.every.filter)
             by_file[path.name] = replace(by_file.get(path.name, default), payload=labels)
     return replace(options, settings=settings, files=by_file)
+
+
+def _labels_in(name: str, labels: Iterable[str]) -> tuple[str, ...]:
+    """Return the labels that are words of a recording's name, such as ``load`` of ``training_load_log``.
+
+    Digits may follow a label, as in ``training_load2_log``, unless the longer word is a label, too.
+    """
+    words = []
+    for label in labels:
+        word = re.compile(rf"(?<![^\W_]){re.escape(label)}(?![^\W\d_])", re.IGNORECASE)
+        if word.search(name):
+            words.append(label)
+    return tuple(label for label in words if not any(label != word and word.startswith(label) for word in words))
+
+
+def unrecorded_payloads(session: Session) -> list[str]:
+    """Return the labels of the session's payloads that no training recording carries."""
+    if not session.settings.dynamics.payloads:
+        return []
+    options = options_of(session)
+    carried = set()
+    for path in session.brought("training"):
+        carried.update(options.file_settings(str(path)).payload)
+    return [label for label in session.settings.dynamics.payloads if label not in carried]
 
 
 def excite(session: Session, say: Say) -> list[str]:
@@ -342,11 +365,16 @@ def _gathered(
 ) -> inputs.IdentificationInputs:
     """Return the inputs of the identification: calibrated robot, training recordings, validation recordings."""
     motions = designed_motions(session)
+    options = options_of(session)
+    # the options of a recording of the session that is not read here do not apply
+    brought = {path.name for path in session.brought("training", "unseen")}
+    read = {Path(parse_cut(recording)[0]).name for recording in (*training, *unseen)}
+    by_file = {name: entry for name, entry in options.files.items() if name in read or name not in brought}
     return inputs.gather(
         session.fit.path,
         training,
         unseen,
-        options=options_of(session),
+        options=replace(options, files=by_file),
         seed=session.settings.seed,
         designed=[motions["training"]] if "training" in motions else [],
         progress=say,

@@ -149,7 +149,7 @@ def with_answer(answers: Answers, question: Question, text: str) -> Answers:
         case "limits":
             value = None if is_empty else text
         case "payloads":
-            value = [] if is_empty else text.split()
+            value = [] if is_empty else [part.strip() for part in text.split(";")]
         case "obstacles":
             value = [text]
         case "dynamics" | "details":
@@ -190,7 +190,7 @@ def checked(answers: Answers) -> FieldValues:
             raise UsageError(f"--{option} and --limits both describe the cell; put it into {answers.limits}")
 
     optional = {
-        "payloads": dict(map(_payload, answers.payloads)),
+        "payloads": stated_payloads(answers.payloads),
         "certificate": asdict(answers.certificate),
         "tool": answers.tool,
         "program": answers.program,
@@ -202,16 +202,39 @@ def checked(answers: Answers) -> FieldValues:
     return result | {name: value for name, value in optional.items() if value and value != NONE}
 
 
-def _payload(text: str) -> tuple[str, float]:
-    """Return label and mass [kg] of a payload given as ``label=kg``."""
-    label, _, mass = text.partition("=")
+def stated_payloads(texts: Sequence[str]) -> dict[str, dict[str, object]]:
+    """Return the payloads of a session by label, from answers such as ``loaded=3.28 at 0,0,0.05``.
+
+    Raises:
+        UsageError: for an invalid answer, or a label that is stated twice.
+    """
+    payloads: dict[str, dict[str, object]] = {}
+    for text in texts:
+        label, payload = _payload(text)
+        require(
+            label not in payloads, f"--payload {text}: '{label}' is stated twice; give each payload a label", UsageError
+        )
+        payloads[label] = payload
+    return payloads
+
+
+def _payload(text: str) -> tuple[str, dict[str, object]]:
+    """Return label and keys of a payload, given as ``label``, ``label=kg`` or ``label=kg at x,y,z``."""
+    labelled_mass, _, position = text.partition(" at ")
+    label, equals, mass = (part.strip() for part in labelled_mass.partition("="))
+    payload: dict[str, object] = {}
     try:
-        value = float(mass.removesuffix("kg"))
+        require(label.isidentifier(), "the label", ValueError)
+        if equals:
+            payload["mass"] = Real(above=0, most=MAX_MASS, unit="kg", quantity="1").read(mass.removesuffix("kg"))
+        if position:
+            payload["com"] = _lengths(position, 3, MAX_HELD)
     except ValueError:
-        value = float("nan")
-    if not label.isidentifier() or not 0.0 < value < MAX_MASS:
-        raise UsageError(f"--payload {text}: expected label=kg, e.g. loaded=3.28 (the label goes into the file's name)")
-    return label, value
+        form = "label=kg, e.g. loaded=3.28, label=kg at x,y,z with the centre of mass in the tip's frame [m], or label"
+        raise UsageError(
+            f"--payload {text}: expected {form} (the label goes into the file's name; what is not stated is identified)"
+        ) from None
+    return label, payload
 
 
 NONE = "none"

@@ -167,9 +167,15 @@ class SessionStep:
             return ""
         if kind == "unseen" and (not dynamics.validation or dynamics.holdout):
             return ""
-        if not kind or session.brought(kind):
+        if not kind:
             return ""
-        return words
+        if not session.brought(kind):
+            return words
+        if kind == "training":
+            missing = dynamics_steps.unrecorded_payloads(session)
+            if missing:
+                return f"{words} with '{missing[0]}'; if there is none, remove [dynamics.payloads] from session.toml"
+        return ""
 
 
 ROBOT = NamedFile("robot", "file")
