@@ -1,6 +1,4 @@
-"""Findings on another gravity or load that explains the recordings better than the stated one
-(catalogue, chapter 9).
-"""
+"""Findings on another gravity or load that explains recordings better than the stated one (catalogue, chapter 9)."""
 
 from collections.abc import Sequence
 

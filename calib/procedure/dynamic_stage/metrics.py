@@ -66,9 +66,7 @@ class ConditionNumber:
 
 @dataclass(frozen=True, eq=False)
 class FilterMetrics:
-    """Sampling rate, cutoffs f_q and f_v by joint, and identification band f_p, all in Hz, and the
-    decimation factor.
-    """
+    """Sampling rate, cutoffs f_q and f_v by joint, identification band f_p, all in Hz, and the decimation factor."""
 
     rate: float
     cutoff: Array
@@ -325,9 +323,7 @@ _STEP = ("ratio", "f", "p", "p_total")
 
 
 def with_current_keys(content: ParsedTable) -> ParsedTable:
-    """Return the content of ``metrics.json`` or ``unseen/report.json`` from an earlier version with
-    the current keys.
-    """
+    """Return the content of an earlier version's ``metrics.json`` or ``unseen/report.json`` with the current keys."""
     if content.get("schema", UNSEEN_SCHEMA - 1) >= UNSEEN_SCHEMA:
         return dict(content)
     result = dict(content)

@@ -207,8 +207,8 @@ def extrapolates(name: str, expected: TorqueIntervals | None) -> list[Finding]:
 
 
 def with_prior(verdict: Verdict, rests: Resting) -> Verdict:
-    """Return the verdict with a remark if a prior, instead of the motion, determines more than half of
-    the parameters.
+    """Return the verdict, with a remark if a prior determines more than half of the parameters instead
+    of the motion.
     """
     if 2 * len(rests.names) <= rests.of:
         return verdict
@@ -246,9 +246,7 @@ def model_findings(cases: Sequence[Case], identification: Identification) -> tup
 
 
 def parameter_findings(identification: Identification[RegressorModel]) -> tuple[Finding, ...]:
-    """Return findings on the parameters of a serial arm or another robot: condition number, bounds,
-    signs, and prior.
-    """
+    """Return findings on the parameters of any robot: condition number, bounds, signs, and prior."""
     removed = []
     if identification.elimination is not None:
         steps = sorted(identification.elimination.steps, key=lambda step: -step.f)
@@ -275,9 +273,7 @@ def parameter_findings(identification: Identification[RegressorModel]) -> tuple[
 
 
 def beyond(case: Case, chain: Chain) -> list[Finding]:
-    """Return a finding on joints that move far beyond the robot's joint limits in a recording;
-    otherwise an empty list.
-    """
+    """Return a finding on joints that move far beyond their limits in a recording; otherwise an empty list."""
     q = np.asarray(case.motion.q)
     excess = np.maximum(chain.lower - q.min(axis=0), q.max(axis=0) - chain.upper)
     tolerance = BEYOND * (chain.upper - chain.lower)
