@@ -207,9 +207,7 @@ def extrapolates(name: str, expected: TorqueIntervals | None) -> list[Finding]:
 
 
 def with_prior(verdict: Verdict, rests: Resting) -> Verdict:
-    """Return the verdict, with a remark if a prior determines more than half of the parameters instead
-    of the motion.
-    """
+    """Return the verdict, with a remark if a prior determines more than half of the parameters."""
     if 2 * len(rests.names) <= rests.of:
         return verdict
     remark = finding("mostly-prior", count=len(rests.names), parameters=rests.of, source=rests.origin)
@@ -305,8 +303,9 @@ def _negative(identification: Identification[RegressorModel]) -> list[Finding]:
 
 
 def _unmodelled(identification: Identification) -> list[Finding]:
-    """Return a finding on joints with autocorrelated residuals, if any; their σ are valid for the
-    recorded motion only.
+    """Return a finding on joints with autocorrelated residuals, if any.
+
+    The σ of these joints' parameters are valid for the recorded motion only.
     """
     inflation = np.nan_to_num(identification.fitted.inflation)
     rows = identification.settings.torque_rows.numbered(identification.dynamics.model.n)

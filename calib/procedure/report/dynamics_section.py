@@ -349,9 +349,7 @@ def _of_all(row: Sequence[str]) -> bool:
 
 
 def _reference_table(unseen: UnseenReport) -> page.ReportTable:
-    """Return the table that compares the errors of the plain references and of the model on held-out motion; may be
-    empty.
-    """
+    """Return the table of errors on held-out motion by the plain references and by the model; may be empty."""
     header = ("recording", "nominal masses, no friction", "plain least squares", "this model")
     rows = []
     for recording, references in unseen.references.items():
@@ -494,9 +492,7 @@ def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.Ge
 
 
 def _effect_table(effects: Sequence[geometry_tables.GeometricEffect]) -> page.ReportTable:
-    """Return the table of geometric errors, with the parameter that each error shifts most, and the effect on the
-    torque.
-    """
+    """Return the table of geometric errors, with the parameter that each shifts most, and the effect on the torque."""
     header = (
         "geometric error",
         "sigma",

@@ -167,9 +167,7 @@ class Report:
     source: str = ""
 
     def with_unseen(self, validation: ValidationMetrics, sets: Sequence[RowErrors]) -> Report:
-        """Return the report with further held-out rows (`rows_of`), and with the updated verdict,
-        reason and warnings.
-        """
+        """Return the report with further held-out rows (`rows_of`), and with updated verdict, reason and warnings."""
         metrics = replace(self.metrics, **vars(validation))
         replaced = {rows.name for rows in sets}
         remaining = [rows for rows in self.sets if rows.name not in replaced]

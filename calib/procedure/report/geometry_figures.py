@@ -157,8 +157,10 @@ def error_map(
 def _map_panel(
     points: np.ndarray, sizes_mm: np.ndarray, limits_mm: tuple[float, float], axis: int, title: str
 ) -> Panel:
-    """Return a map of sizes [mm] at points (m, 3) [m] over x and another axis (1: y, 2: z); only z
-    gets a colour bar.
+    """Return a map of sizes [mm] at points (m, 3) [m] over x and another axis.
+
+    Args:
+        axis: vertical axis of the map: 1 for y, 2 for z; only the map over z has a colour bar.
     """
     layers = [
         dots(points[:, 0], points[:, axis], sizes_mm, *limits_mm, "[mm]" if axis == 2 else ""),

@@ -1,6 +1,4 @@
-"""Figures of a designed or planned motion: joint motion with limits, tool path, search history, and trade-offs of
-goals.
-"""
+"""Figures of a designed or planned motion: joint motion with limits, tool path, search history, trade-offs of goals."""
 
 from __future__ import annotations
 
@@ -129,8 +127,8 @@ def _dense_motion(designed: Designed) -> SampledMotion:
 
 
 def design_figures(designed: Designed) -> dict[str, Chart]:
-    """Return the figures of a designed motion by name: motion, search history, and, if available, path, front and
-    outlook.
+    """Return the figures of a designed motion by name: motion, search history, and, if available,
+    path, front, outlook.
     """
     figures = {"motion": _motion_figure(designed), "history": _history_figure(designed)}
     if isinstance(designed.inputs.chain, Chain):

@@ -221,8 +221,9 @@ def met(value: float, tolerance: float) -> str:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of a report; a section on a judged result has a verdict (pass, marginal, fail), a reason
-    and key figures.
+    """A part of a report.
+
+    A section on a judged result has a verdict (pass, marginal, fail), a reason and key figures.
     """
 
     title: str

@@ -1,6 +1,4 @@
-"""The certificate's page on the dynamics: torque errors in N·m and as shares of the limits, figures,
-and uncertainty.
-"""
+"""The certificate's page on the dynamics: torque errors in N·m and as shares of the limits, and uncertainty."""
 
 from __future__ import annotations
 
@@ -106,9 +104,7 @@ def _torque_table(report: DynamicReport, order: np.ndarray) -> ReportTable:
 
 
 def _curves(report: DynamicReport, order: np.ndarray) -> Iterator[Picture]:
-    """Yield one picture of the torques with the largest errors: measured and predicted; nothing if
-    there are no curves.
-    """
+    """Yield a picture of the torques with the largest errors, measured and predicted; nothing without curves."""
     from calib.procedure.report.charts import vector
     from calib.procedure.report.dynamics_figures import torques
 
@@ -144,8 +140,12 @@ def _uncertainty(report: DynamicReport) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class _DesignSetting:
-    """Settings of a designed motion: period [s], names of the columns to identify, number of instants with checked
-    limits.
+    """Settings of a designed motion.
+
+    Attributes:
+        period: period of the motion [s].
+        columns: names of the columns to identify.
+        instants_verified: number of instants at which the limits were checked.
     """
 
     period: float

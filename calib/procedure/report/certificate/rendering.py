@@ -121,9 +121,7 @@ def _typeset(inputs: Mapping[str, bytes], dense: bool) -> tuple[bytes, list[str]
 
 
 def _fonts() -> Iterator[tuple[list[str], Any]]:
-    """Yield lists of fonts in the order in which they are tried, each with a PDF standard; None: PDF without a
-    standard.
-    """
+    """Yield lists of fonts in the order of the trials, each with a PDF standard; None: PDF without a standard."""
     import typst
 
     yield [FONT], STANDARD

@@ -100,8 +100,9 @@ def tolerance(millimetres: float | None, metrics: FitMetrics) -> str:
 
 
 def measured_range(metrics: FitMetrics) -> str:
-    """Return a text on the measured range of each joint, for which the verdict is valid; empty for fits of earlier
-    versions.
+    """Return a text on the measured range of each joint, in which the verdict is valid.
+
+    Empty for fits of earlier versions.
     """
     joint_range = None if metrics.findings is None else metrics.findings.joint_range
     if joint_range is None:
@@ -183,9 +184,7 @@ class SectionResult(Protocol):
 
 
 def notebook(result: SectionResult) -> str:
-    """Return a result as HTML for a notebook: the first page of the certificate for a fit, otherwise a
-    report section.
-    """
+    """Return a result as HTML for a notebook: the certificate's first page for a fit, otherwise a report section."""
     from calib.procedure.kinematic_stage.fit import Outcome
     from calib.procedure.report import fit_report
 
