@@ -1,4 +1,4 @@
-"""Settings of designing and planning motions: the same defaults for commands, guided run and scripts."""
+"""Settings for designing and planning motions; commands, guided procedure and scripts use the same defaults."""
 
 import re
 from dataclasses import dataclass
@@ -59,9 +59,9 @@ Start = tuple[Annotated[float, Real(infinite=True, quantity="1")], ...]
 @checked
 @dataclass(frozen=True)
 class ExcitationSettings:
-    """Settings of designing and playing an exciting motion.
+    """Settings for designing and playing an exciting motion.
 
-    Without goals the logarithms of both condition numbers are minimised in equal parts.
+    Without goals, the logarithms of both condition numbers (raw and normalised) are minimised with equal weights.
 
     Attributes:
         goals: raw=35, normalised=6 (condition numbers), wrist=0.1 or joint6=0.1 (mean torque as a share of the limit,
@@ -130,7 +130,7 @@ DEFAULT_DESIGN = ExcitationSettings()
 @checked
 @dataclass(frozen=True)
 class PlanSettings:
-    """Settings of planning a motion through waypoints.
+    """Settings for planning a motion through waypoints.
 
     Attributes:
         payloads: label of an identified payload that is attached; repeatable

@@ -504,8 +504,9 @@ def _uses(out: Path, of_files: Mapping[str, Verdicts]) -> Iterator[str]:
 
 
 def _remarked(content: bytes, remark: str) -> bytes:
-    """Return the content of an XML or YAML file with a one-line remark as a comment at the head; unchanged if it is
-    empty.
+    """Return the content of an XML or YAML file with a one-line remark as a comment at the head.
+
+    Without a remark, the content is unchanged.
     """
     if not remark:
         return content

@@ -141,9 +141,7 @@ def exported_prediction(robot: IdentifiedRobot, folder: Path) -> ExportedPredict
 
 
 def notes_of(robot: IdentifiedRobot) -> list[str]:
-    """Return findings, as text, on the exported inertias and masses, and on parameters that no robot
-    file can contain.
-    """
+    """Return findings, as text, on the exported inertias and masses, and on parameters that no robot file contains."""
     solution, drives = robot.found, robot.drives
     findings = [
         finding(

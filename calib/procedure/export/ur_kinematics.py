@@ -58,9 +58,7 @@ def kinematics(robot: CalibratedChain, urdf: Path | None = None) -> tuple[str, s
 
 
 def _flange_note(robot: CalibratedChain) -> str:
-    """Return a remark on the assumed position of UR's flange if a fixed joint follows the last joint;
-    otherwise empty.
-    """
+    """Return a remark on the assumed position of UR's flange if a fixed joint follows the last joint; else empty."""
     nominal = nominal_of(robot)
     zero = np.zeros((1, nominal.n))
     behind = invert(joint_frames(nominal, zero)[-1, 0]) @ forward(nominal, zero)[0]

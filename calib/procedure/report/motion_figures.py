@@ -127,9 +127,7 @@ def _dense_motion(designed: Designed) -> SampledMotion:
 
 
 def design_figures(designed: Designed) -> dict[str, Chart]:
-    """Return the figures of a designed motion by name: motion, search history, and, if available,
-    path, front, outlook.
-    """
+    """Return the figures of a designed motion by name: motion, history, and, if available, path, front and outlook."""
     figures = {"motion": _motion_figure(designed), "history": _history_figure(designed)}
     if isinstance(designed.inputs.chain, Chain):
         figures["path"] = _path_figure(designed)

@@ -256,9 +256,7 @@ def _names(paths: list[Path]) -> str:
 
 @dataclass(frozen=True)
 class _Plan:
-    """The content of ``selection.json``: a text on how the poses were selected, the checked and the
-    unchecked limits.
-    """
+    """The content of ``selection.json``: how the poses were selected, as text, and the checked and unchecked limits."""
 
     words: str = "chosen by hand"
     checked: tuple[str, ...] = ()
@@ -288,9 +286,7 @@ def _filed(paths: list[Path]) -> list[Path]:
 
 
 def listed(session: Session) -> list[FileRow]:
-    """Return name, role, size [bytes] and SHA-256 of the files that the certificate lists, the most important ones
-    first.
-    """
+    """Return name, role, size [bytes] and SHA-256 of the files in the certificate, the most important ones first."""
     judged_files = {}
     if session.path(VERDICT).exists():
         judged_files = read_json(session.path(VERDICT)).get("files", {})

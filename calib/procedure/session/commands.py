@@ -163,9 +163,7 @@ def _to_record(session: Session, step: str) -> tuple[str, str]:
 
 
 def _to_play(session: Session, names: Sequence[str], with_payloads: bool) -> str:
-    """Return the instructions to play the designed motions with the given names, and to repeat them
-    with each payload.
-    """
+    """Return instructions to play the designed motions with the given names, and to repeat them with each payload."""
     section = session.settings.dynamics
     file = RUN if section.repeats > 1 else SAMPLES
     motions = " and, into a separate file, ".join(str(session.path(f"6-excitation/{name}/{file}")) for name in names)

@@ -112,8 +112,9 @@ def _training_settings(session: Session) -> ExcitationSettings:
 
 
 def _validation_settings(session: Session) -> ExcitationSettings:
-    """Return the settings of the validation motion: another period and seed, and states within those of the training
-    motion.
+    """Return the settings of the validation motion.
+
+    The motion has another period and seed than the training motion, and states within those of the training motion.
     """
     section = session.settings.dynamics
     return replace(

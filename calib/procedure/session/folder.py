@@ -143,8 +143,8 @@ class Session:
 
     @property
     def links(self) -> FieldValues:
-        """Names of the arm's base and tip link: as stated in `calib new`, otherwise as in the fit; None: chosen by
-        default.
+        """Names of the arm's base and tip link, as stated in `calib new` or found in the fit; None:
+        chosen by default.
         """
         links: FieldValues = {"base": self.settings.robot.base or None, "tip": self.settings.robot.tip or None}
         fitted = self.fit.path / ROBOT
@@ -195,7 +195,7 @@ class Session:
 
     @property
     def needs(self) -> bool:
-        """Whether the settings request an accuracy of torques or parameters, for which further motions
+        """Whether the settings request an accuracy of torques or parameters, so that further motions
         may be designed.
         """
         section = self.settings.dynamics

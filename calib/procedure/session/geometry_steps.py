@@ -404,9 +404,7 @@ def fit(session: Session, say: Say) -> list[Note]:
 
 
 def validate(session: Session, say: Say) -> list[Note]:
-    """Validate the fitted robot on held-out poses, as `calib fit` does with validation files; return notes for the
-    user.
-    """
+    """Validate the fitted robot on held-out poses like `calib fit` with validation files; return notes for the user."""
     chain, unseen = chain_of(session), session.brought("validation")
     metrics, report = session.fit.metrics(), fit_report.read(session.fit.report)
     # images are read with the lens and board of those of the fit

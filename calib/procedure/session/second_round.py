@@ -221,9 +221,7 @@ def promised(session: Session) -> tuple[str, ...]:
 
 
 def _short_of_default(session: Session) -> tuple[str, ...]:
-    """Return a line on joints and parameters that do not meet the default accuracy, and how to request a further
-    motion.
-    """
+    """Return a line on joints and parameters below the default accuracy, and on how to request a further motion."""
     joints = _short_joints(session, NEED)
     weak = _weak_parameters(session, NEED)
     names = load_calibrated(session.fit.path).chain.joint_names

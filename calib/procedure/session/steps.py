@@ -433,8 +433,10 @@ def _missing(session: Session, step: SessionStep) -> str:
 
 
 def _fingerprints(session: Session, step: SessionStep) -> dict[str, str]:
-    """Return the fingerprints of the files and settings on which a step depends: name -> SHA-256, or value of the
-    setting.
+    """Return the fingerprints of the files and settings on which a step depends.
+
+    Returns:
+        Name -> SHA-256 of the file, or value of the setting as JSON.
     """
     marks = {}
     for path in step.inputs(session):

@@ -79,9 +79,7 @@ def _uncertainty_findings(metrics: FitMetrics) -> list[str]:
 
 
 def _figures(report: Report, row_errors: RowErrors, label: str) -> Iterator[Picture]:
-    """Yield histograms of nominal and calibrated errors, and a map of calibrated errors with a mark at
-    the worst pose.
-    """
+    """Yield histograms of nominal and calibrated errors, and a map of calibrated errors that marks the worst pose."""
     from calib.procedure.report.charts import text, vector
     from calib.procedure.report.geometry_figures import error_histogram, error_map
     from calib.procedure.report.style import MARK
