@@ -245,8 +245,9 @@ def search_motion(
 def _reached(
     problem: ExcitationProblem, goals: Sequence[AttainmentGoal], result: SearchResult, inputs: ExcitationInputs
 ) -> tuple[float, ...]:
-    """Return the value of each goal that a motion reaches at `INSTANTS` samples, without smoothing of
-    Coulomb friction.
+    """Return the value of each goal that a motion reaches at `INSTANTS` samples.
+
+    Coulomb friction is not smoothed additionally.
     """
     if not goals:
         return ()
@@ -312,9 +313,7 @@ def _with_whole_samples(
 
 
 def _condition_objective(inputs: ExcitationInputs, settings: ExcitationSettings) -> Excitation:
-    """Return the condition number of the identifiable columns as an objective, with the information of
-    earlier motions.
-    """
+    """Return the condition number of the identifiable columns as an objective, including earlier motions."""
     existing = None
     if inputs.prior is not None:
         existing = inputs.prior.per_sample(settings.samples, settings.repeat * settings.period)

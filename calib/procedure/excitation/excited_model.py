@@ -1,5 +1,6 @@
-"""The dynamic model whose parameters a designed motion shall excite: from an identification, or from
-robot and options.
+"""The dynamic model whose parameters a designed motion shall excite.
+
+It is read from an identification, or built from the robot's description and options.
 """
 
 from collections.abc import Sequence

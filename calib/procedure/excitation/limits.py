@@ -270,7 +270,7 @@ class MotionLimits:
         return BoxLimit(0, -unlimited, unlimited)
 
     def narrowed(self, ranges: Sequence[tuple[np.ndarray, np.ndarray]]) -> "MotionLimits":
-        """Return the limits with velocity, acceleration and position also limited to the range of another motion.
+        """Return the limits, with position, velocity and acceleration also limited to the range of another motion.
 
         Joints that do not move in the other motion are not limited further.
 
@@ -284,8 +284,9 @@ class MotionLimits:
         return replace(self, constraints=(*self.constraints, *boxes))
 
     def broken(self, motion: SampledMotion) -> Iterator[tuple[MotionConstraint, str, int]]:
-        """Yield each violated constraint with a message and the index of the worst of N states; joint limits are not
-        checked.
+        """Yield each violated constraint with a message and the index of the worst of N sampled states.
+
+        Joint limits are not checked.
         """
         for limit in self.constraints:
             if isinstance(limit, BoxLimit):
@@ -494,9 +495,7 @@ class _PoseLimit:
 
 
 def _position_constraints(settings: LimitsFile, pose_limits: Limits, points: Points) -> list[MotionConstraint]:
-    """Return constraints on the workspace of the tip and of named points, and all other constraints of
-    pose selection.
-    """
+    """Return constraints on the workspace of tip and named points, and all other constraints of pose selection."""
     constraints: list[MotionConstraint] = []
     radius = settings.target.axis_distance
     lowest, highest = settings.target.heights

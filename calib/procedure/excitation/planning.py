@@ -157,9 +157,7 @@ PerJoint = Annotated[tuple[float, ...], Expect("a list of numbers, one per joint
 @strict
 @dataclass(frozen=True)
 class _DrivesFile:
-    """The file of ``calib plan --drives``: table ``[drives]`` with Ia, Fv, Fc, off per joint as needed (SI, joint
-    side).
-    """
+    """The file of ``calib plan --drives``: table ``[drives]`` with Ia, Fv, Fc, off per joint (SI, joint side)."""
 
     drives: Mapping[str, PerJoint] = field(default_factory=dict)
 
@@ -336,9 +334,7 @@ def _shortened(
 
 
 def _read_drives(tables: Tables | None, chain: Chain) -> dict[str, np.ndarray]:
-    """Return drive parameters (n,) by name, from TOML: table ``[drives]`` with Ia, Fv, Fc, off as needed (SI, joint
-    side).
-    """
+    """Return drive parameters (n,) by name, from TOML: table ``[drives]`` with Ia, Fv, Fc, off (SI, joint side)."""
     content, where = read(_DrivesFile, tables, "drives")
     check_keys(content.drives, DRIVES, f"{where}: drives")
     drives = {}

@@ -238,9 +238,7 @@ def _root(W: np.ndarray) -> np.ndarray:
 
 
 def _geometry_torques(inputs: ExcitationInputs, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """Return the changes (N, rows, r) of the torques by r principal errors of the geometry; r = 0 for an exact
-    geometry.
-    """
+    """Return the changes (N, rows, r) of the torques by r principal errors of the geometry; r = 0 without them."""
     if inputs.geometry is None or inputs.model.values is None:
         return np.zeros((len(q), len(inputs.model.exact.joint_of_row), 0))
     return inputs.geometry.felt(inputs.model.values, q, v, a)

@@ -33,9 +33,7 @@ class PrincipalErrors(Protocol):
 
     @property
     def before(self) -> np.ndarray:
-        """Shifts (b, r) of an earlier identification's parameters by each principal error; zero without an
-        identification.
-        """
+        """Shifts (b, r) of an earlier identification's parameters by each error; zero without an identification."""
         ...
 
     def felt(self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:

@@ -143,9 +143,7 @@ class Session:
 
     @property
     def links(self) -> FieldValues:
-        """Names of the arm's base and tip link, as stated in `calib new` or found in the fit; None:
-        chosen by default.
-        """
+        """Names of the arm's base and tip link, as in `calib new` or in the fit; None: chosen by default."""
         links: FieldValues = {"base": self.settings.robot.base or None, "tip": self.settings.robot.tip or None}
         fitted = self.fit.path / ROBOT
         if links["tip"] is None and is_urdf(self.robot_file) and fitted.is_file():
@@ -195,9 +193,7 @@ class Session:
 
     @property
     def needs(self) -> bool:
-        """Whether the settings request an accuracy of torques or parameters, so that further motions
-        may be designed.
-        """
+        """Whether the settings request an accuracy of torques or parameters, so that motions may be added."""
         section = self.settings.dynamics
         return self.dynamic and section.plan and bool(section.tolerance_percent or section.sigma_percent)
 
