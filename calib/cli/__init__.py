@@ -155,8 +155,7 @@ def _spread(arguments: list[str]) -> list[str]:
     """Return the arguments of the command line with ``--validate a b`` expanded to ``--validate a --validate b``.
 
     The expansion is made only if --validate is after ROBOT and MEASURED, since the texts after --validate could
-    otherwise
-    be these two arguments.
+    otherwise be these two arguments.
     """
     commands = [argument for argument in arguments[:2] if argument in ("fit", "identify", "compare")]
     if not commands:

@@ -1,4 +1,7 @@
-"""Answers to `calib new`, given as options or at a terminal. This module imports little: `calib` starts fast."""
+"""Answers to the questions of `calib new`, as command options or from a terminal.
+
+This module imports only small modules, so that `calib` starts fast.
+"""
 
 from dataclasses import dataclass, field
 from datetime import date

@@ -179,17 +179,23 @@ def level_of(finding: Finding) -> str:
 
 
 def _rank(finding: Finding) -> int:
-    """Return how serious a finding is: the position of its level in `RANKS`."""
+    """Return the position of a finding's level in `RANKS`, in which levels are sorted by severity."""
     return RANKS.index(level_of(finding))
 
 
 def limit(code: str, value: str, level: str = "fail") -> float:
-    """Return the limit above which a value of a finding reaches a level."""
+    """Return the limit in the catalogue above which a value of a finding reaches a level.
+
+    Args:
+        code: code of the finding.
+        value: name of the value.
+        level: the level.
+    """
     return catalogue()[code].limits[value][level]
 
 
 def settle(findings: Iterable[Finding], accepted: Collection[str] = ()) -> tuple[Finding, ...]:
-    """Return the findings that reach a level, worst first.
+    """Return the findings that reach a level (note, marginal or fail) of the catalogue, worst first.
 
     Args:
         findings: findings of a stage.
@@ -234,7 +240,7 @@ def notes_of(findings: Iterable[Finding]) -> list[Note]:
 
 
 def lines_of(findings: Iterable[Finding]) -> list[str]:
-    """Return the text of the notes of findings."""
+    """Return a line of text for each finding: its sentence, its advice, and how the user can accept it."""
     return [note.text for note in notes_of(findings)]
 
 
@@ -258,7 +264,7 @@ def _line(finding: Finding, entry: CatalogueEntry) -> str:
 
 @cache
 def glossary() -> Mapping[str, str]:
-    """Return the technical terms of messages and reports, term -> meaning."""
+    """Return the glossary of technical terms in messages and reports: term -> meaning."""
     return tomllib.loads(Path(__file__).with_name("glossary.toml").read_text(encoding="utf-8"))
 
 

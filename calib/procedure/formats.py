@@ -115,7 +115,10 @@ def describe(topic: str) -> str:
 
 
 def json_schema(topic: str) -> str:
-    """Return the JSON schema (draft 2020-12) of a kind of TOML file; editors use it to complete and check keys.
+    """Return the JSON schema (draft 2020-12) of a TOML file format; editors use it to complete and check keys.
+
+    Args:
+        topic: name of the file format.
 
     Raises:
         UsageError: for a topic without a schema; the message lists the topics that have one.

@@ -52,8 +52,7 @@ class RobotKind(Protocol):
             settings: settings of the identification.
             known: known parameters of payloads: name -> value [SI].
             reference: index of the joint relative to whose gain the other gains are identified; None: a payload is
-                known,
-                and the gains are absolute.
+                known, and the gains are absolute.
         """
         ...
 

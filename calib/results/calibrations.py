@@ -107,7 +107,15 @@ class StoredFit(CalibratedRobot):
         return FitFolder(self.path)
 
     def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
-        """Return certificate and report of the fit."""
+        """Return certificate and report of the fit.
+
+        Args:
+            details: certificate entries made by a person.
+            plots: whether to include figures.
+
+        Raises:
+            UsageError: if the folder belongs to a session, or has no data of a report.
+        """
         self._refuse_in_session()
         if not FitFolder(self.path).report.exists():
             self.refuse("certificate")
@@ -134,7 +142,15 @@ class StoredIdentification(CalibratedRobot):
         return delivery.Export(settings.urdf, identified=self.path, prior=settings.prior)
 
     def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
-        """Return certificate and report of the identification."""
+        """Return certificate and report of the identification.
+
+        Args:
+            details: certificate entries made by a person.
+            plots: whether to include figures.
+
+        Raises:
+            UsageError: if the folder belongs to a session.
+        """
         self._refuse_in_session()
         return certificates.read_model(self.path, plots, details)
 
@@ -151,7 +167,7 @@ class StoredSession(Viewed):
         return self._session
 
     def require_session(self) -> Session:
-        """Return the session."""
+        """Return the session; other kinds of results raise an error."""
         return self.session
 
     @property
@@ -210,7 +226,12 @@ class StoredSession(Viewed):
         return results
 
     def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
-        """Return certificate and report of a finished session."""
+        """Return certificate and report of a finished session.
+
+        Args:
+            details: ignored, since ``session.toml`` contains the details.
+            plots: whether to include figures.
+        """
         from calib.procedure.session import certificate
 
         return certificate.pages(replace(self.session, plots=plots))

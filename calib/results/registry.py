@@ -69,7 +69,7 @@ class StoredSelection(StoredFile):
     """Poses selected by `calib select`: a CSV file, with prediction and figures next to it."""
 
     def beside(self) -> list[Path]:
-        """Return the files of prediction and figures next to the CSV."""
+        """Return the paths of prediction and figures, which are next to the CSV."""
         start = self.path.with_suffix("")
         return [Path(f"{start}{self.kind.companion}"), *sorted(start.parent.glob(f"{start.name}_*{PICTURE_SUFFIX}"))]
 

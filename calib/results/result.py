@@ -54,15 +54,15 @@ class Result(Protocol):
         ...
 
     def figures(self) -> Mapping[str, Picture]:
-        """Return the figures by name."""
+        """Return the figures: name -> figure."""
         ...
 
     def tables(self) -> Mapping[str, Table]:
-        """Return the tables by name, as in the files that `save` writes."""
+        """Return the tables, as in the files that `save` writes: name -> table."""
         ...
 
     def scene(self, robot: str | None = None) -> Scene:
-        """Return the scene that the viewer draws: robot, poses, motions, torques.
+        """Return the scene for the viewer: robot, poses, motions, torques.
 
         Args:
             robot: name or file of the robot to draw; None: the result's robot.

@@ -82,8 +82,7 @@ class Measured:
         seen, nominal, calibrated: (m, 3) measured and predicted positions [m].
         unseen: (m,) whether the row was held out from the fit.
         turned: (m, 3) rotation vector from the calibrated arm's orientation to the measured one, as in
-            ``residuals.csv``
-            [rad]; NaN if no orientation was measured.
+            ``residuals.csv`` [rad]; NaN if no orientation was measured.
     """
 
     q: np.ndarray
@@ -109,8 +108,7 @@ class ErrorSizes:
     """Errors of m measured rows without a position in the arm's base frame: magnitudes only.
 
     Distances, bars, sockets, planes and images measure no position. Validation rows with a base and tool placement of
-    their
-    own measure positions in a frame that the fit's folder does not contain.
+    their own measure positions in a frame that the fit's folder does not contain.
 
     Attributes:
         kind: ``position`` if the row's residual is a position (in the instrument's frame, from a socket's mean point or
@@ -129,8 +127,7 @@ class ErrorSizes:
 
 @dataclass(frozen=True, eq=False)
 class Played:
-    """A motion, with name, times t (N,) [s], joint values q (N, n) [rad or m], and velocities v (N,
-    n); None: unknown.
+    """A motion, with name, times t (N,) [s], joint values q (N, n) [rad or m], and velocities v (N, n); None: unknown.
     """
 
     name: str

@@ -79,7 +79,12 @@ def read(folder: str | Path, robot: str | None = None) -> Scene:
 
 
 def _robot(folder: Path, robot: str | None) -> tuple[Chain | Drawn | None, Path | None]:
-    """Return the robot to draw (None if unknown), and its URDF or other description (None if not found)."""
+    """Return the robot to draw (None: unknown), and the file of its description, such as a URDF (None: not found).
+
+    Args:
+        folder: the result folder.
+        robot: name or file of the robot; None: the robot in the folder.
+    """
     stage = stage_of(robot or folder, "view")
     if stage is not None:
         return stage.run(), None
@@ -138,7 +143,11 @@ def visuals(path: str | Path) -> tuple[list[Visual], list[str]]:
 
 
 def _errors(folder: Path, chain: Chain | Drawn | None) -> tuple[list[Measured], list[ErrorSizes]]:
-    """Return the errors of a fit's rows and of a session's held-out poses: rows with position, and magnitudes only."""
+    """Return the errors of a fit's rows and of a session's held-out poses.
+
+    Returns:
+        Errors with positions in the arm's base frame, and errors of which only the magnitudes are known.
+    """
     measured = []
     sizes = []
     for fit_folder in (folder, folder / IN_SESSION):
@@ -152,8 +161,7 @@ def _errors(folder: Path, chain: Chain | Drawn | None) -> tuple[list[Measured], 
 
 
 def _measured(folder: Path, chain: Chain | Drawn | None) -> Measured:
-    """Return the measured positions in ``residuals.csv``, with the predictions of the nominal and the
-    calibrated arm.
+    """Return the measured positions in ``residuals.csv``, with the predictions of the nominal and the calibrated arm.
     """
     if isinstance(chain, Drawn):
         return Measured(*chain.measured(folder))
@@ -237,7 +245,7 @@ def _with_unseen(fitted: Measured, errors: Path) -> Measured:
 
 
 def _points(cell: Installation, q: np.ndarray, station: int, tool: int) -> np.ndarray:
-    """Return the tool's positions (m, 3) in the station's frame, deflections included."""
+    """Return the tool's positions (m, 3) [m] in the station's frame at joint values q (m, n), deflections included."""
     return see(cell, q, station, tool).point.T
 
 
@@ -247,8 +255,7 @@ def _joint_values(table: Table, cell: Installation) -> np.ndarray:
 
 
 def _triples(table: Table, head: str, dimension: str) -> np.ndarray:
-    """Return three columns of a table, named `head` followed by x, y, z, as an array (m, 3) in SI; NaN
-    for empty cells.
+    """Return three columns of a table, named `head` followed by x, y, z, as an array (m, 3) in SI; NaN for empty cells.
     """
     return np.column_stack([table.numbers(f"{head}{axis}", dimension, gaps=True) for axis in "xyz"])
 
@@ -311,8 +318,7 @@ def _motions(folder: Path) -> list[Played]:
 
 
 def _all_torques(folder: Path, chain: Chain | Drawn | None) -> list[Torques]:
-    """Return the measured and predicted torques in a folder and its subfolders; only held-out motion
-    if there is any.
+    """Return the measured and predicted torques in a folder and its subfolders; only held-out motion if there is any.
     """
     result = []
     for path in _below(folder, "torques_*.csv"):
@@ -329,11 +335,11 @@ def _all_torques(folder: Path, chain: Chain | Drawn | None) -> list[Torques]:
 
 
 def _torque_rows(folder: Path, chain: Chain | Drawn | None, count: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the labels and units of an identification's torque rows.
+    """Return the labels and the units of an identification's torque rows.
 
     Args:
-        folder: folder of the table of torques: that of the identification, or its subfolder ``unseen``.
-        chain: the robot; None if unknown.
+        folder: folder with the table of torques: that of the identification, or its subfolder ``unseen``.
+        chain: the robot; None: unknown.
         count: number of torque rows.
     """
     if chain is not None:
@@ -376,8 +382,7 @@ def _model_rows(model: dict, chain: Chain | Drawn, count: int) -> tuple[tuple[st
 
 
 def _below(folder: Path, pattern: str) -> list[Path]:
-    """Return the files that match a pattern in a folder and in subfolders down to two levels, the
-    folder's files first.
+    """Return the files that match a pattern in a folder and in subfolders down to two levels, the folder's files first.
     """
     paths = []
     for subfolders in ("", "*/", "*/*/"):

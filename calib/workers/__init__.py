@@ -4,8 +4,7 @@
 ``trajectories`` take `Workers.map` as a plain callable. Functions, tasks and results must be picklable. If a process
 dies, its task is repeated, by this module or by the scheduler: a task may run twice, but yields one result. A task that
 fails repeatedly yields a `TaskLost` and does not affect the other tasks. Only a few tasks are in progress at a time
-(one
-per process, or per thread of the cluster), so that there may be millions of tasks; each should take a tenth of a
+(one per process, or per thread of the cluster), so that there may be millions of tasks; each should take a tenth of a
 second or more.
 
 Processes are spawned, not forked, since forked threads of numerical libraries may block; scripts that use workers need

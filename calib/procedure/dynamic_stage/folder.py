@@ -234,8 +234,7 @@ def _write_torques(
     """Write a table of measured and predicted torques and joint positions of a recording, at about `TORQUE_RATE`.
 
     If `intervals` are known, two columns are added: the expected standard deviation of the torque error, and whether
-    the
-    model extrapolates (1) or not (0). Recordings without a payload also get velocities and accelerations, which
+    the model extrapolates (1) or not (0). Recordings without a payload also get velocities and accelerations, which
     `read_torques` requires.
 
     Args:
@@ -288,8 +287,7 @@ def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[object, ...]]:
 
     The σ of a parameter is its total σ, from torque noise and geometry; the relative standard deviation (RSD) is in
     percent. The σ from the geometry is NaN if the geometry is taken as exact. Friction terms that were switched off,
-    and
-    parameters fixed by a constraint, have no σ (NaN), because they were not estimated from the measurement.
+    and parameters fixed by a constraint, have no σ (NaN), because they were not estimated from the measurement.
     """
     identification, carried = outcome.found, outcome.carried
     estimate = identification.fitted.estimate

@@ -145,14 +145,10 @@ def effects(carried: GeometryUncertainty) -> list[GeometricEffect]:
     """Return the rows of ``geometry_effects.csv``, sorted by the shift that one σ of the element causes, largest first.
 
     `shift_sigma` is the shift of the most affected parameter if the element changes by one σ, in units of that
-    parameter's
-    σ from torque noise; `shift_sigma_per_milli` is the shift if the element changes by 1 mm or 1 mrad. `torque_rms` is
-    the
-    rms change of the rigid-body torque by one σ at constant parameters; `torque_rms_left` is the change that remains
-    after
-    the parameters have been estimated again. `matters` is ``yes`` if the element alone raises the σ of some parameter
-    by
-    more than 1 %; it is empty for elements without σ.
+    parameter's σ from torque noise; `shift_sigma_per_milli` is the shift if the element changes by 1 mm or 1 mrad.
+    `torque_rms` is the rms change of the rigid-body torque by one σ at constant parameters; `torque_rms_left` is the
+    change that remains after the parameters have been estimated again. `matters` is ``yes`` if the element alone raises
+    the σ of some parameter by more than 1 %; it is empty for elements without σ.
     """
     rows = []
     shifts_per_unit = _per_sigma(carried)
@@ -202,7 +198,7 @@ def _geometries(comparison: GeometryComparison, essential: Sequence[str]) -> Ite
 
 
 def _essential_names(outcome: IdentificationOutcome) -> tuple[str, ...]:
-    """Return the names of the essential parameters; all names if none were removed."""
+    """Return the names of the essential parameters; if no parameters were eliminated, all names."""
     identification = outcome.found
     if identification.elimination is None:
         return identification.names

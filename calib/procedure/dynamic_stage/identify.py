@@ -72,8 +72,7 @@ class RecordingErrors:
             that are also in the training motion.
         excitation: name of a training recording -> report on what its motion can identify.
         intervals: name of a held-out recording -> expected torque errors; without held-out recordings, those of the
-            first
-            training recording.
+            first training recording.
     """
 
     fit: Mapping[str, Score]

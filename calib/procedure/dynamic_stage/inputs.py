@@ -56,8 +56,7 @@ class IdentificationInputs:
 
     Attributes:
         robot: `CalibratedChain` from a geometric fit or from a description, with joint corrections only if they move
-            the
-            links; or a `calib.procedure.robot_kinds.Mechanism`.
+            the links; or a `calib.procedure.robot_kinds.Mechanism`.
         source: file from which the robot was read.
         cases: training recordings.
         unseen: held-out recordings, whose torques are predicted.

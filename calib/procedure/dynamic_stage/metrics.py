@@ -77,7 +77,7 @@ class FilterMetrics:
 
     @classmethod
     def of(cls, motion: Motion) -> FilterMetrics:
-        """Return the filter metrics of a motion."""
+        """Return rate, cutoffs, band and decimation factor of a filtered motion."""
         return cls(motion.rate, motion.cutoff, motion.band, motion.decimator.factor, motion.velocity_cutoff)
 
 
@@ -141,7 +141,7 @@ def _judged(assessment: DynamicsAssessment) -> FieldValues:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ModelMetrics(JudgedMetrics):
-    """The content of ``metrics.json``; see `calib.identification.model_file`."""
+    """The content of an identification's ``metrics.json``; see `calib.identification.model_file`."""
 
     identification: Mapping[str, Score]
     parameters: ParameterCounts
@@ -225,8 +225,7 @@ def _error_density(identification: Identification, cases: Sequence[Case]) -> np.
     """Return the spectral density of the torque errors (rows,) [N² m² s or N² s].
 
     The density is the variance of the errors divided by the number of independent rows per second; the information
-    matrix
-    of a motion with regressor ω is ∫ ωᵀω / density dt.
+    matrix of a motion with regressor ω is ∫ ωᵀω / density dt.
     """
     count = sum(len(rows.target) for rows in identification.rows)
     per_second = count / sum(case.duration for case in cases)

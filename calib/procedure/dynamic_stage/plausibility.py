@@ -1,7 +1,7 @@
 """Findings on implausible sizes, signs and clocks of recordings (findings catalogue, chapter 9).
 
-The catalogue contains the limits and sentences. A finding that makes the model's values grossly wrong fails the
-verdict or limits it to marginal, unless the options' ``accept`` names the finding.
+The catalogue contains the limits and sentences. A finding that makes the model's values grossly wrong fails the verdict
+or limits it to marginal, unless the options' ``accept`` names the finding.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence

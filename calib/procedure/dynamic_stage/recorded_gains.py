@@ -75,8 +75,7 @@ def find_gains(
     Args:
         chain: the arm.
         options: options of the identification; if they name recordings without and with a known payload, these
-            determine
-            the gains.
+            determine the gains.
         motions: path of a recording -> motion, for all recordings.
         training: paths of the training recordings, from which relative gains are identified.
         say: called with a text on each step.

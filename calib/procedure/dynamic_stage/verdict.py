@@ -147,8 +147,7 @@ def _joints(scores: Mapping[str, Score], rows: Sequence[str], coordinate: str) -
     """Return a finding on joints whose torque the model does not explain; an empty list if there are none.
 
     The error is computed in the identification band, since noise is not a model error, and for moving joints only,
-    since
-    friction at rest can take any value.
+    since friction at rest can take any value.
     """
     threshold = limit("joints-unexplained", "worst", "marginal")
     unexplained: dict[int, float] = {}

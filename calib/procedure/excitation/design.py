@@ -42,10 +42,8 @@ class DesignCondition:
     """Condition numbers of the observation matrix: raw (SI units), and normalised (columns of unit norm).
 
     With earlier motions, `raw` and `normalised` apply to all motions together, `…_alone` to the new motion, and
-    `…_before`
-    to the earlier motions. `…_alone` and `…_before` are None without earlier motions, or if the motions by themselves
-    do
-    not determine all columns.
+    `…_before` to the earlier motions. `…_alone` and `…_before` are None without earlier motions, or if the motions by
+    themselves do not determine all columns.
     """
 
     raw: float
@@ -56,7 +54,8 @@ class DesignCondition:
     normalised_before: float | None = None
 
     def table(self) -> dict[str, float]:
-        """Return the values as the entry ``condition_number`` of ``metrics.json``."""
+        """Return the entry ``condition_number`` of ``metrics.json``: name of a condition number -> value, without None.
+        """
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
@@ -135,17 +134,16 @@ def excite(
 
     Without goals, the logarithms of both condition numbers, raw and normalised, are minimised with equal weights; an
     aim such as ``logdet`` replaces them. With goals (``wrist=0.1``), the condition numbers become goals, too. Unless
-    the
-    settings state their goal values, these are the values reached in a first search for the condition numbers alone (as
-    the study advises).
+    the settings state their goal values, these are the values reached in a first search for the condition numbers alone
+    (as the study advises).
 
     Ctrl-C ends the search; the best motion found until then is verified and returned.
 
     Args:
         robot, base, tip: see `calib.robot.library`.
         settings: see `calib.procedure.excitation.settings`.
-        model: folder of an identification, from which torques, friction and their uncertainty are taken; None: from
-            the robot's description.
+        model: folder of an identification, from which torques, friction and their uncertainty are taken; None: from the
+            robot's description.
         limits: see `calib.procedure.excitation.limits`; None: limits of the robot's description.
         options: options of the later identification: torque rows, drive terms, payloads; None: defaults.
         after: folder of an identification whose recordings the motion shall complement; replaces `model`; None: none.
@@ -327,8 +325,7 @@ def _searched(
     """Return the motion that a search finds, and the optimisation problem that was solved.
 
     If there are goals, but none for the condition numbers, a first search without goals determines the goal values of
-    the
-    condition numbers.
+    the condition numbers.
     """
     has_condition_goal = any(isinstance(goal.objective, Excitation) for goal in goals)
     if not goals or has_condition_goal:

@@ -157,7 +157,10 @@ def check_held(model: ExcitedModel, limits: MotionLimits) -> None:
 
 
 def _designable(rows: TorqueRows) -> bool:
-    """Return whether a motion can be designed for torque rows: they depend on the bodies and are differentiable."""
+    """Return whether a motion can be designed for the given torque rows.
+
+    The rows must depend on the rigid bodies, and must be differentiable.
+    """
     return rows.has_bodies and rows.projection is None
 
 

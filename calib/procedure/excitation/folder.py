@@ -171,7 +171,8 @@ def _write_setpoints(track: Setpoints, bounds: MotionBounds, path: Path) -> Path
 
 
 def _write_approach_and_rehearsal(motion: Playback | Planned, bounds: MotionBounds, folder: Path) -> None:
-    """Write ``approach.csv`` and ``rehearsal.csv`` if the motion has an approach and a rehearsal."""
+    """Write the setpoints of approach and rehearsal, if the motion has them, as ``approach.csv`` and ``rehearsal.csv``.
+    """
     if motion.approach is not None:
         _write_setpoints(motion.approach, bounds, folder / APPROACH)
     if motion.rehearsal is not None:
@@ -266,7 +267,7 @@ def _condition_text(raw: float | None, normalised: float | None) -> str:
 
 
 def design_lines(designed: Designed) -> list[str]:
-    """Return the lines that `calib excite` prints: condition number, goals, margins, limits, notes."""
+    """Return the lines that `calib excite` prints: condition numbers, reached goals, margins, limits, and notes."""
     motion, condition, proof, playback = designed.found, designed.condition, designed.proof, designed.playback
     column_count = len(designed.inputs.columns.aimed_names)
     prior = designed.inputs.prior
@@ -348,7 +349,7 @@ def plan_metrics(planned: Planned) -> dict[str, object]:
 
 
 def plan_lines(planned: Planned) -> list[str]:
-    """Return the lines that `calib plan` prints: duration, margins, limits, notes."""
+    """Return the lines that `calib plan` prints: duration, margins, limits, and notes."""
     lines = [
         f"{planned.track.duration:.3f} s at {planned.track.rate:g} Hz; closer than {ACTIVE:.0%} to a limit for "
         f"{planned.active_share:.1%} of the time; all limits are respected at "

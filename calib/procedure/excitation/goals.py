@@ -168,7 +168,7 @@ def _objective(
 
 
 def wrist(n: int) -> tuple[int, ...]:
-    """Return the indices of the last two of n joints."""
+    """Return the indices of the wrist joints, which are the last two of n joints."""
     return tuple(range(max(0, n - 2), n))
 
 

@@ -111,8 +111,8 @@ def read_inputs(
     Args:
         robot, base, tip: see `calib.robot.library`.
         settings: settings of the design.
-        model: folder of an identification, from which torques, friction and their uncertainty are taken; None: from
-            the robot's description.
+        model: folder of an identification, from which torques, friction and their uncertainty are taken; None: from the
+            robot's description.
         limits: see `calib.procedure.excitation.limits`; None: limits of the robot's description.
         options: options of the later identification: torque rows, drive terms, payloads; None: defaults.
         after: folder of an identification whose recordings the motion shall complement; it replaces `model`, and its

@@ -172,8 +172,7 @@ class MotionBounds:
         """Check that setpoints respect the limits of velocity and acceleration, and `MAX`.
 
         `MAX` is a value that no real joint reaches. It matters if light links and high torque limits would allow
-        accelerations
-        that no robot reaches.
+        accelerations that no robot reaches.
 
         Raises:
             UsageError: for a violated limit; the message names the joint and the limit.
@@ -222,7 +221,7 @@ class FrequencyTable:
 @strict
 @dataclass(frozen=True)
 class LimitsFile(ConstraintsFile):
-    """The content of a limits file; values per joint are in the unit of the joint."""
+    """The content of a limits file; values per joint are in the joint's units (rad or m, s, N m or N)."""
 
     velocity: Mapping[str, Numeric] = field(default_factory=dict)
     acceleration: Mapping[str, Numeric] = field(default_factory=dict)
@@ -262,7 +261,7 @@ class MotionLimits:
 
     @property
     def positions(self) -> BoxLimit:
-        """Limits of the joint positions; infinite: not limited."""
+        """Limits of the joint positions [rad or m]; infinite: not limited."""
         for constraint in self.constraints:
             if isinstance(constraint, BoxLimit) and constraint.order == 0:
                 return constraint

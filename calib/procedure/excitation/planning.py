@@ -75,8 +75,8 @@ def read_waypoints(
         waypoints: the file; or in memory joint values (m, n) [rad or m], poses (m, 4, 4) [m], or targets.
         chain: arm with the best known geometry, whose tip is to reach the waypoints.
         lower, upper: (n,) joint limits of the solution.
-        start: (n,) joint values of the robot before the motion, near which the first waypoint is solved; None: near
-            the middle of the joint limits.
+        start: (n,) joint values of the robot before the motion, near which the first waypoint is solved; None: near the
+            middle of the joint limits.
 
     Raises:
         UsageError: for a waypoint that cannot be reached; the message states its number and the distance.

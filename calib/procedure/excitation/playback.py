@@ -1,7 +1,7 @@
 """Setpoints of an exciting motion for a controller: approach, periods, and a slow rehearsal.
 
-The approach leads slowly from the robot's present posture to the start of the motion, with limited jerk, and within
-the limits of the limits file.
+The approach leads slowly from the robot's present posture to the start of the motion, with limited jerk, and within the
+limits of the limits file.
 """
 
 from collections.abc import Sequence

@@ -7,8 +7,8 @@ explains, a log of R independent rows per joint yields the base parameters with 
 
 and the torque of another motion with the variance Y C Yᵀ. On a calibrated robot, an error g of the geometry, which is
 equal in all logs, adds to both (`calib.identification.uncertainty.geometry_uncertainty`). It changes the parameters by
-S g = -C Σ Yᵀ (∂Y/∂g φ) g / σ², with earlier motions by C (C_before⁻¹ S_before g - …), and the torques by
-Y S g + (∂Y/∂g φ) g. A design minimises only the part from torque errors.
+S g = -C Σ Yᵀ (∂Y/∂g φ) g / σ², with earlier motions by C (C_before⁻¹ S_before g - …), and the torques by Y S g + (∂Y/∂g
+φ) g. A design minimises only the part from torque errors.
 
 R is the number of rows that `calib identify` uses: twice the identification band, computed from the accelerations by
 the rules of the identification. Before a log exists, σ_j is unknown: it consists of noise, and of friction that no term
@@ -75,8 +75,7 @@ class PredictedSigma(NamedTuple):
     """A row of ``prediction.csv``: a parameter, and the σ predicted for the motion as it is to be run.
 
     The value is None if unknown, and `rsd` is σ in percent of the value. `sigma_before` is the σ of the identification
-    that
-    the motion complements, `sigma_geometry` the part of σ from the geometry; both are None if there is none.
+    that the motion complements, `sigma_geometry` the part of σ from the geometry; both are None if there is none.
     """
 
     name: str
@@ -109,8 +108,7 @@ class MotionOutlook:
         noise: (n,) assumed torque error [N m or N].
         own: prediction for the designed motion as it is to be run.
         by_period: predictions for other durations: longer ones repeat the designed motion, shorter ones are designed by
-            a
-            quick search.
+            a quick search.
         before: `torque_sigma_share` of the identification that the motion complements; None: no such identification.
         torque_sigma_before: (n,) `torque_sigma` of that identification [N m or N]; None: no such identification.
     """
@@ -223,7 +221,8 @@ def known_sigmas(inputs: ExcitationInputs, task: Task) -> tuple[tuple[np.ndarray
 
 
 def _information_root(inputs: ExcitationInputs) -> np.ndarray:
-    """Return a square root W (c, c) of the earlier motions' information matrix Wᵀ W, for the columns of the design."""
+    """Return a square root W (c, c) of the earlier motions' information matrix Wᵀ W, for the c columns of the design.
+    """
     assert inputs.prior is not None
     columns = inputs.columns.kept
     values, V = np.linalg.eigh(inputs.prior.information[columns][:, columns])
@@ -245,7 +244,10 @@ def _geometry_torques(inputs: ExcitationInputs, q: np.ndarray, v: np.ndarray, a:
 
 
 def _shifts_before(inputs: ExcitationInputs) -> np.ndarray:
-    """Return the shifts (c, r) of an earlier identification's parameters by r principal errors of the geometry."""
+    """Return the shifts (c, r) of an earlier identification's parameters by r principal errors of the geometry.
+
+    Without principal errors, r is 0.
+    """
     if inputs.geometry is None:
         return np.zeros((len(inputs.columns.names), 0))
     return inputs.geometry.before[inputs.columns.kept]

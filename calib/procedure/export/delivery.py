@@ -327,7 +327,11 @@ def deliver(export: Export, out: Path) -> list[str]:
 
 
 def deliver_single(export: Export, targets: Mapping[str, Path]) -> list[str]:
-    """Write single files of an export, each to the path given in `targets` (file name -> path).
+    """Write single files of an export.
+
+    Args:
+        export: sources of the export.
+        targets: file name -> path of the written file; other files are not written.
 
     Returns:
         Remarks on the written files, as text.
@@ -349,8 +353,7 @@ def check_into(export: Export, into: Path, folder: Path) -> None:
 
     Raises:
         UsageError: if the folder is not usable, or contains inputs or files that no export writes; the message names
-            the
-            folder or file.
+            the folder or file.
     """
     names = [file.name for file in export.files]
     marks: tuple[str, ...] = (PARAMETERS,)
@@ -364,8 +367,7 @@ def fit_verdicts(folder: Path) -> Verdicts:
     """Return the verdicts on a fit and its deliverables, read from the folder of the fit.
 
     In a session, these are the verdicts on held-out poses. Empty if the folder is from an earlier version without
-    verdict,
-    or if the session has not yet judged the fit.
+    verdict, or if the session has not yet judged the fit.
     """
     try:
         record = _fit_record(folder)
@@ -378,8 +380,7 @@ def model_verdicts(folder: Path) -> Verdicts:
     """Return the verdict on an identification, read from the folder of the identification.
 
     In a session, this is the verdict on held-out motion. Empty if the folder is from an earlier version without
-    verdict, or
-    if the session has not yet judged the model.
+    verdict, or if the session has not yet judged the model.
     """
     try:
         record = _identification_record(folder)

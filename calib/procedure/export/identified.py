@@ -186,7 +186,7 @@ def notes_of(robot: IdentifiedRobot) -> list[str]:
 
 
 def parameters(robot: IdentifiedRobot) -> dict[str, object]:
-    """Return the content of ``parameters.json``."""
+    """Return the content of ``parameters.json``: parameters of geometry and dynamics with their covariances."""
     estimate, solution, chain = robot.information, robot.found, robot.chain
     model = solution.dynamics.model
     return {

@@ -34,11 +34,9 @@ def kinematics(robot: CalibratedChain, urdf: Path | None = None) -> tuple[str, s
     """Return the text of a kinematics file for ur_description, and a remark for the user (empty: none).
 
     The file states x, y, z, roll, pitch, yaw of six joint origins [m, rad]. The frames are UR's (base_link_inertia,
-    then
-    one frame per joint with z as the joint's axis). They follow from the nominal arm's axes, so that the numbers differ
-    from UR's nominal numbers only by the calibration. ur_description places tool0 at wrist_3. Fixed joints after
-    wrist_3 in
-    the robot's file (a flange, a tool) are not included, which the remark states.
+    then one frame per joint with z as the joint's axis). They follow from the nominal arm's axes, so that the numbers
+    differ from UR's nominal numbers only by the calibration. ur_description places tool0 at wrist_3. Fixed joints after
+    wrist_3 in the robot's file (a flange, a tool) are not included, which the remark states.
 
     Args:
         robot: the calibrated robot, with any base and tip links.
@@ -81,8 +79,7 @@ def _inertia_frame(nominal: Chain, urdf: Path | None, up: np.ndarray, ahead: np.
     """Return the pose (4, 4) of UR's frame base_link_inertia in the arm's base frame.
 
     UR's descriptions have a link with this name, turned by 180° about z relative to base_link. Without such a link, z
-    is
-    along axis 1, -x is the direction in which the arm is stretched at q = 0, and the origin is that of the base.
+    is along axis 1, -x is the direction in which the arm is stretched at q = 0, and the origin is that of the base.
 
     Args:
         nominal: the arm.
@@ -108,8 +105,7 @@ def _template(nominal: Chain, urdf: Path | None) -> str:
 
     d1: height of axis 2; a2, a3: distances of axes 2 to 3 and 3 to 4; d4: distance of axis 5 from axis 1; d5: height of
     axis 4 over axis 6; d6: distance of the last joint's frame from axis 5. If this frame is on axis 5, d6 is the
-    distance
-    of the tip (early UR URDFs have d6 in the fixed joint to tool0).
+    distance of the tip (early UR URDFs have d6 in the fixed joint to tool0).
     """
     if nominal.n != 6 or any(joint.kind != "revolute" for joint in nominal.joints):
         raise RobotError(f"it has {nominal.n} joints; expected six revolute joints")

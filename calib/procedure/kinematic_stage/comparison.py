@@ -83,23 +83,19 @@ class Comparison:
         poses: number of robot poses.
         frames: text on the source of the base and tool placement.
         proves: whether a verdict may be based on the errors; False if the rows were fitted, or if the placement of base
-            and
-            tool did not converge or absorbed the errors.
+            and tool did not converge or absorbed the errors.
         alone: errors of the calibrated robot as a URDF describes it, without corrections and with frames fitted to the
-            same
-            rows; None if the robot has no corrections.
+            same rows; None if the robot has no corrections.
         shares_frames: whether base and tool placement of another file were used.
         repeated: repeatability and accuracy from poses that were measured several times; None without such poses.
         reprojection: rms distance between detected and predicted corners, of both arms [px]; None without images.
         settled: False if the placement of base and tool on these rows did not converge; then the errors are
             meaningless.
         placed_by: number of measured values, and number of placement parameters fitted to them, if there are too few
-            values
-            to judge by the errors (`MARGIN`); otherwise None.
+            values to judge by the errors (`MARGIN`); otherwise None.
         intervals: errors of the calibrated arm with their predicted intervals; None without an error model of the fit.
         plain: errors of the plain reference, with frames fitted to the same rows; None on fitted rows, and without a
-            plain
-            reference.
+            plain reference.
     """
 
     blocks: tuple[PoseMeasurements, ...]
@@ -271,7 +267,7 @@ def compare_unseen(
 
 
 def interval_cells(comparison: Comparison) -> np.ndarray:
-    """Return the table cells (m, 3) of `INTERVAL` for all rows; NaN if the fit has no error model."""
+    """Return the values (m, 3) of the columns `INTERVAL` for all m rows; NaN if the fit has no error model."""
     intervals = comparison.intervals
     if intervals is None:
         row_count = sum(len(block) for block in comparison.blocks)

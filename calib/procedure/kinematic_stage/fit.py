@@ -71,7 +71,7 @@ class Outcome:
 
     @property
     def robot(self) -> CalibratedChain:
-        """Calibrated robot with covariance and corrections, for identification, excitation and export."""
+        """Calibrated robot with covariance and joint corrections, as used by identification, excitation and export."""
         robot = calibrated_chain(self.selection.fit, self.rigid, self.inputs.nominal)
         if robot.corrections is not None and self.inputs.masses is not None:
             # the corrections' gravity torques are those of the identified masses
@@ -85,8 +85,7 @@ class Outcome:
         """Installation of the arm before any calibration, with base and tool placed to fit the rows best.
 
         If the robot is from an earlier fit, the nominal arm of that fit is placed, although the new fit started from
-        the
-        calibrated geometry of the earlier fit.
+        the calibrated geometry of the earlier fit.
         """
         nominal = self.inputs.nominal
         if nominal is self.inputs.chain:
@@ -108,7 +107,7 @@ class Outcome:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings for the user."""
+        """Texts of findings and remarks for the user."""
         return self.assessment.warnings
 
     @property

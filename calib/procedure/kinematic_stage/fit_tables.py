@@ -52,7 +52,7 @@ NOT_FITTED = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class EstimateTable:
-    """Rows of ``estimate.csv``, and their covariance (rows, rows)."""
+    """Rows of ``estimate.csv`` (name, unit, nominal value, value), and the covariance (rows, rows) of the values."""
 
     names: tuple[str, ...]
     units: tuple[str, ...]
@@ -153,8 +153,7 @@ def residuals(outcome: Outcome) -> tuple[Iterator[Sequence[object]], list[str]]:
 
     Held-out rows also have the columns of `INTERVAL`, as in ``errors.csv`` of a session: ``sigma`` is the standard
     deviation of the calibrated arm's position error by the fit's error model, ``interval95`` is the radius that
-    contains
-    95 % of such errors, and ``extrapolated`` is 1 if a joint is outside the range of the fitted rows.
+    contains 95 % of such errors, and ``extrapolated`` is 1 if a joint is outside the range of the fitted rows.
     """
     sets = [("fit", outcome.fit)]
     for name, unseen in outcome.inputs.unseen.items():
@@ -172,7 +171,13 @@ def residuals(outcome: Outcome) -> tuple[Iterator[Sequence[object]], list[str]]:
 
 
 def _residual_rows(label: str, comparison: Comparison, outcome: Outcome) -> Iterator[Sequence[object]]:
-    """Yield the rows of ``residuals.csv`` for one set of measurements."""
+    """Yield the rows of ``residuals.csv`` for one set of measured rows.
+
+    Args:
+        label: name of the set: ``fit``, ``held out`` or ``validation``.
+        comparison: the measured rows, and the arms that predict them.
+        outcome: the fit.
+    """
     nominal, calibrated = comparison.cells
     nominal_blocks = prepare(nominal, comparison.blocks)
     blocks = prepare(calibrated, comparison.blocks)
@@ -226,9 +231,8 @@ def write_errors(path: Path, arm: Chain, validation: Mapping[str, Comparison]) -
     """Write the errors of both arms at every validation row, and the error vectors of measured positions.
 
     For measured positions, ``x y z`` is the measured position of the target. ``to_nominal`` and ``to_calibrated`` are
-    the
-    vectors from there to the positions predicted by each arm, all in the calibrated arm's base frame. The columns of
-    `INTERVAL` are as in ``residuals.csv``.
+    the vectors from there to the positions predicted by each arm, all in the calibrated arm's base frame. The columns
+    of `INTERVAL` are as in ``residuals.csv``.
 
     Args:
         path: path of the table.

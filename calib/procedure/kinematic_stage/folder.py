@@ -86,7 +86,7 @@ class FitFolder:
 
     @property
     def tables(self) -> tuple[Path, Path]:
-        """Paths of the parameter estimate and of its covariance."""
+        """Paths of the parameter estimate (``estimate.csv``) and of its covariance (``covariance.csv``)."""
         return self.path / ESTIMATE, self.path / COVARIANCE
 
     def metrics(self) -> FitMetrics:

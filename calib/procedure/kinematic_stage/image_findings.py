@@ -55,7 +55,7 @@ def _rms(residuals: np.ndarray) -> float:
 
 
 def image_notes(fit: GeometricFit) -> list[Finding]:
-    """Return the findings on the images of a fit; empty without images."""
+    """Return findings on the images of a fit: reprojection error, noise, coverage and scale; empty without images."""
     notes: list[Finding] = []
     without_images = [block.measured for block in fit.blocks if not isinstance(block.measured, Pixels)]
     other_files = [Path(block.file).name for block in without_images]

@@ -91,8 +91,7 @@ class Inputs:
 
     @property
     def bare(self) -> Chain | None:
-        """Geometry of an earlier fit for use without its joint corrections; None if the earlier fit
-        has no corrections.
+        """Geometry of an earlier fit for use without its joint corrections; None if the earlier fit has no corrections.
         """
         if self.earlier is None or self.earlier.corrections is None:
             return None
@@ -100,7 +99,7 @@ class Inputs:
 
     @property
     def nominal(self) -> Chain:
-        """Nominal arm, before any calibration."""
+        """Nominal arm before any calibration; if the robot is from an earlier fit, the nominal arm of that fit."""
         if self.earlier is None or self.earlier.nominal is None:
             return self.chain
         return self.earlier.nominal

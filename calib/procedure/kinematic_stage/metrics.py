@@ -78,7 +78,11 @@ class ComparedRows:
         return nature
 
     def judged(self, deliverable: str) -> ArmErrors:
-        """Return the errors on which the verdict on a deliverable (``urdf`` or ``corrections``) is based."""
+        """Return the errors of the deliverable that is judged.
+
+        Args:
+            deliverable: ``urdf`` or ``corrections``.
+        """
         if deliverable == "urdf" and self.urdf_alone is not None:
             return self.urdf_alone
         return self.calibrated
@@ -97,14 +101,14 @@ class Outlier:
 
     @property
     def size(self) -> str:
-        """Residual with its unit, as text."""
+        """Size of the residual with its unit, as text."""
         if self.size_deg is None:
             return f"{self.size_mm:.3g} mm"
         return f"{self.size_deg:.3g} deg"
 
     @property
     def words(self) -> str:
-        """File, row and residual, as text."""
+        """File, row number and size of the residual, as text."""
         return f"{Path(self.file).name} row {self.row} ({self.size}, {self.sigmas:.1f} sigma)"
 
 
@@ -170,7 +174,7 @@ class ValidationMetrics:
 
 @dataclass(frozen=True, kw_only=True)
 class FitMetrics(ValidationMetrics):
-    """The content of ``metrics.json``; see `calib.procedure.kinematic_stage.folder`."""
+    """The content of a fit's ``metrics.json``; see `calib.procedure.kinematic_stage.folder`."""
 
     fit: ComparedRows
     model: str

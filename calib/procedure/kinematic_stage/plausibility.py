@@ -54,10 +54,8 @@ def misfit(selection: ModelSelection, reach: float) -> Finding | None:
     """Return a finding if no rigid geometry explains the measurements; otherwise None.
 
     The condition is an error above `FLOOR` times the reach, both on the fitted rows (corrected for degrees of freedom)
-    and
-    in cross-validation, since few poses predict each other badly under any model. If the error of the chosen model,
-    joint
-    corrections included, is below this limit, the finding is only a note.
+    and in cross-validation, since few poses predict each other badly under any model. If the error of the chosen model,
+    joint corrections included, is below this limit, the finding is only a note.
 
     Args:
         selection: the selection of models by cross-validation.
@@ -186,8 +184,7 @@ def findings(
 
 
 def _as_positions(block: PoseMeasurements) -> PoseMeasurements:
-    """Return a block of measurements; images are replaced by board poses, whose scale is that of the
-    board's squares.
+    """Return a block of measurements; images are replaced by board poses, whose scale is that of the board's squares.
     """
     if not isinstance(block, Pixels):
         return block
@@ -200,8 +197,7 @@ def _as_positions(block: PoseMeasurements) -> PoseMeasurements:
 def _wrong_columns(
     nominal: Installation, blocks: Sequence[PoseMeasurements], before: float, reach: float
 ) -> list[Finding]:
-    """Return a finding if the nominal arm explains the rows after a change of columns or rows;
-    otherwise an empty list.
+    """Return a finding if the nominal arm explains the rows after a change of columns or rows; otherwise an empty list.
     """
     if not before > FLOOR * reach:
         return []

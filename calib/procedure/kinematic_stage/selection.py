@@ -106,7 +106,7 @@ class Chosen:
 
     @property
     def figure_names(self) -> tuple[str, ...]:
-        """Names of the available figures; none if a parameter is not identifiable."""
+        """Names of the figures that can be drawn; empty if a parameter is not identifiable."""
         if self.prediction is None:
             return ()
         if self.outlook.others:
@@ -431,8 +431,8 @@ def table(chosen: Chosen) -> list[tuple[str, str]]:
 
 
 def predicted_rows(chosen: Chosen) -> list[tuple[str, str]]:
-    """Return table rows (label, text) on the predicted accuracy, and on the accuracy lost by line-of-
-    sight constraints.
+    """Return table rows (label, text) on the predicted accuracy, and on the accuracy lost by line-of- sight
+    constraints.
     """
     outlook = chosen.outlook
     rows = forecast.table(outlook.poses, outlook.others)

@@ -59,7 +59,7 @@ class _Proof:
 
     @property
     def ratio(self) -> float:
-        """Ratio of the calibrated to the nominal arm's error."""
+        """Error of the calibrated arm divided by the error of the nominal arm."""
         return self.after / max(self.before, TINY)
 
 
@@ -343,7 +343,7 @@ class Assessment:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings for the user, worst first."""
+        """Texts of findings and remarks for the user, worst first."""
         return tuple(dict.fromkeys((*lines_of(self.noticed), *self.notes)))
 
     @property
@@ -494,8 +494,7 @@ def _noticed(name: str, rows: Comparison, usual: float) -> Iterator[Finding]:
 
     The instrument may have moved if the nominal arm's errors are far above the usual ones. Doubtful rows may be wrong
     measurements. The placement of base and tool may not have converged, or may have absorbed most of the errors. The
-    last
-    finding states the share of errors within the 95 % intervals.
+    last finding states the share of errors within the 95 % intervals.
 
     Args:
         name: name of the validation file.

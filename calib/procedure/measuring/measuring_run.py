@@ -1,9 +1,9 @@
 """A measuring run: poses in the fastest order, collision-free paths between them, and the duration.
 
-Moves are straight in joint space, like a controller's joint moves. Each move is sampled so densely that no point of
-the arm moves further than the clearance between two samples; each sample is checked for collisions with the arm itself,
-the floor and obstacles. If a straight move collides, a path through via-points replaces it; the arm is assumed to stop
-at each via-point.
+Moves are straight in joint space, like a controller's joint moves. Each move is sampled so densely that no point of the
+arm moves further than the clearance between two samples; each sample is checked for collisions with the arm itself, the
+floor and obstacles. If a straight move collides, a path through via-points replaces it; the arm is assumed to stop at
+each via-point.
 
 The file of a run has one row per stop, in time order::
 
@@ -127,8 +127,9 @@ class MeasuringRun:
 
     @property
     def found_ways(self) -> Ways:
-        """The collision-free paths: (smaller, larger) index of the two poses -> path from the smaller to the larger
-        index.
+        """The collision-free paths: indices of two poses, the smaller one first -> path between these poses.
+
+        The path leads from the pose with the smaller index to the other pose.
         """
         clear_ways = {}
         for k, (start, end) in enumerate(pairwise(self.order)):
@@ -241,9 +242,8 @@ def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray)
     """Return the poses (m, n) with each revolute joint's angles moved by whole turns into one interval of 360°.
 
     A joint with a range above 360° reaches some angles at several joint values. To keep moves short, the interval
-    begins
-    in the middle of the largest gap between the poses' angles if this gap exceeds 30°; otherwise half a turn below the
-    middle of the joint's range. An angle that would leave the joint limits remains unchanged.
+    begins in the middle of the largest gap between the poses' angles if this gap exceeds 30°; otherwise half a turn
+    below the middle of the joint's range. An angle that would leave the joint limits remains unchanged.
     """
     full = 2 * np.pi
     result = q.copy()
@@ -318,10 +318,8 @@ def way_to(
     """Return the index of a start posture and a collision-free path (k, n) from it to one of the goal postures.
 
     The goals nearest to a start are tried in the order of move duration, at most `MAX_NEIGHBOURS` of them. For each
-    goal,
-    straight moves from the `MAX_NEIGHBOURS` nearest starts are tried or, without `straight`, moves with via-points from
-    the
-    nearest start. None: no collision-free path was found.
+    goal, straight moves from the `MAX_NEIGHBOURS` nearest starts are tried or, without `straight`, moves with
+    via-points from the nearest start. None: no collision-free path was found.
 
     Args:
         chain: the arm.
@@ -423,8 +421,7 @@ def _room(chain: Chain, limits: MoveLimits, velocity: np.ndarray) -> Room:
     """Return the collision test of paths.
 
     A path is free if the distance between parts is at least half the clearance at samples that are at most one
-    clearance
-    apart. Without a collision model, every posture is free.
+    clearance apart. Without a collision model, every posture is free.
     """
     model, clearance = limits.collision, limits.clearance
     reach = np.array([chain.stretched_length() if joint.kind == "revolute" else 1.0 for joint in chain.joints])

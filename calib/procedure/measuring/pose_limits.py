@@ -344,8 +344,7 @@ def _sight(settings: ConstraintsFile, cell: Installation, where: str, model: Dis
     """Return the lines of sight: acceptance cone and range if stated, and no link of the arm in between.
 
     None if the file states no instrument or no condition on its lines of sight. An instrument for which only roll and
-    pitch
-    are stated is a camera; the two ranges limit the target's orientation in its image.
+    pitch are stated is a camera; the two ranges limit the target's orientation in its image.
     """
     table, facing = settings.instrument, settings.target.facing
     if table is None:

@@ -66,11 +66,11 @@ class SelectionPrediction:
 
 @dataclass(frozen=True, eq=False)
 class Prediction(SelectionPrediction):
-    """Predicted accuracy of a fit to m poses: σ of the parameters, and of the tool's position.
+    """Predicted accuracy of a fit: σ of the parameters, and σ of the tool's position at s typical poses.
 
     Attributes:
-        points: (s, 3) positions of the tool at typical poses [m].
-        spread: (s,) σ of the tool's position at these poses [m]; infinite if a parameter is not identifiable.
+        points: (s, 3) positions of the tool [m].
+        spread: (s,) σ of the tool's position [m]; infinite if a parameter is not identifiable.
     """
 
     points: np.ndarray

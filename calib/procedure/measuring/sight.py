@@ -72,7 +72,7 @@ class Sight:
     """The lines of sight from an instrument to the targets of an arm.
 
     Attributes:
-        targets: for each target, the constraints under which it is seen.
+        targets: for each target, the constraints that must be satisfied for the instrument to see it.
     """
 
     targets: tuple[tuple[PoseConstraint, ...], ...]

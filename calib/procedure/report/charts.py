@@ -232,7 +232,7 @@ def heat(
 
 @layer
 def histogram(axes: Axes, counts: ArrayLike, edges: ArrayLike, colour: str = AFTER) -> None:
-    """Draw a histogram of counts (k,) between edges (k + 1,)."""
+    """Draw a histogram of k counts (k,) between bin edges (k + 1,)."""
     axes.stairs(counts, edges, fill=True, color=colour, alpha=0.9)
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
 
@@ -342,8 +342,7 @@ class Chart:
         columns: number of panels in a row.
         title: title of the figure, beside the legend of the first panel; empty: neither title nor legend.
         shared: letters of the axes whose labels are drawn only at the edge of the grid: ``x`` at the lowest panel of
-            each
-            column, ``y`` at the first panel of each row.
+            each column, ``y`` at the first panel of each row.
     """
 
     panels: Sequence[Panel]

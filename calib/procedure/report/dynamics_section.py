@@ -246,8 +246,7 @@ def proof_of(unseen: UnseenReport) -> tuple[str, Score, str]:
     """Return name, score and kind of motion of the recording that decides the verdict.
 
     It is the held-out recording with the largest error; without held-out motion, the training recording with the
-    largest
-    error.
+    largest error.
     """
     scores, motion = unseen.fit, "the training motion"
     if unseen.proofs:

@@ -64,7 +64,7 @@ class CorrelatedPair(NamedTuple):
 
 @dataclass(frozen=True)
 class CorrelationMatrix:
-    """Correlation matrix of the most correlated parameters."""
+    """Names and correlation matrix of the most strongly correlated parameters."""
 
     names: tuple[str, ...]
     matrix: tuple[tuple[float, ...], ...]
@@ -79,8 +79,7 @@ class RowErrors:
         unseen: whether the rows were held out from the fit.
         poses: number of robot poses.
         nominal, calibrated, urdf_alone: errors of the nominal arm, the calibrated arm, and the calibrated arm without
-            joint
-            corrections: nature (position, orientation, distance) -> errors [m, rad].
+            joint corrections: nature (position, orientation, distance) -> errors [m, rad].
         expected: predicted radius that contains 95 % of the calibrated arm's errors [m]; empty: unknown.
         q: (rows, n) joint values [rad or m]; empty if several rows share an error, as are `points` and `rows`.
         points: (rows, 3) target positions in the arm's base frame [m].
@@ -140,8 +139,7 @@ class Report:
         rank: number of singular values that are kept.
         sets: errors on each set of rows.
         noise: nature (position, orientation) -> rms error that the instrument's stated σ alone causes [m, rad]; None:
-            no σ
-            was stated.
+            no σ was stated.
         images: density of detected corners over each camera's images; empty: no images.
         files: files that were read, see `file_row`.
         source: path of the robot's description.
@@ -295,7 +293,7 @@ def _errors_by_row(name: str, comparison: Comparison, unseen: bool, selection: s
 
 
 def _points(comparison: Comparison) -> np.ndarray:
-    """Return the target positions (rows, 3) [m] in the arm's base frame."""
+    """Return the positions (rows, 3) [m] of the targets in the arm's base frame, as predicted by the calibrated arm."""
     cell = comparison.cells[1]
     points = []
     for block in prepare(cell, comparison.blocks):
@@ -344,7 +342,7 @@ def _stated_rms(blocks: Sequence[PoseMeasurements], field_name: str) -> float | 
 
 
 def _plain(values: np.ndarray) -> tuple[Any, ...]:
-    """Return numbers rounded to seven digits, as nested tuples."""
+    """Return numbers rounded to seven significant digits, as a tuple or nested tuples."""
     rounded = [float(f"{value:.7g}") for value in np.ravel(values)]
     nested = np.array(rounded).reshape(np.shape(values)).tolist()
     if np.ndim(values) == 1:
@@ -353,12 +351,12 @@ def _plain(values: np.ndarray) -> tuple[Any, ...]:
 
 
 def write(report: Report, path: Path) -> None:
-    """Write a fit's report as JSON."""
+    """Write a fit's report as JSON to a path."""
     files.write_json(path, report)
 
 
 def read(path: Path) -> Report:
-    """Read a fit's report from JSON.
+    """Return a fit's report, read from a JSON file.
 
     Raises:
         UsageError: if the file is missing or was written by another version.

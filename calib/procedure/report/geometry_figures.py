@@ -292,7 +292,12 @@ def ladder(steps: Sequence[ModelStep], noise: float | None = None) -> Chart:
 
 
 def correlation_map(names: Sequence[str], correlation: np.ndarray) -> Chart:
-    """Return the map of the parameters' correlations (p, p), with their names (p,)."""
+    """Return a map of the correlation matrix (p, p) of parameters.
+
+    Args:
+        names: (p,) names of the parameters.
+        correlation: the matrix.
+    """
     off = np.abs(correlation - np.diag(np.diag(correlation)))
     matrix = heat(correlation, limits=(-1.0, 1.0), colours="PuOr", written=len(names) <= 10)
     # long names widen the figure, and never overlap

@@ -111,8 +111,7 @@ def _key_figures(report: Report) -> list[page.KeyFigure]:
     """Return the errors of the nominal and the calibrated robot on which the verdict is based.
 
     They are those of the worst held-out rows. Without held-out rows, they are the cross-validated errors if the verdict
-    is
-    based on these, otherwise the errors on the fitted rows.
+    is based on these, otherwise the errors on the fitted rows.
     """
     metrics = report.metrics
     if not metrics.proofs:
@@ -337,7 +336,7 @@ def parameter_words(metrics: FitMetrics) -> str:
 
 
 def error_words(metrics: FitMetrics) -> str:
-    """Return the rms errors on the fitted poses as text."""
+    """Return a text on the rms errors on the fitted poses."""
     return f"{_rms_words(metrics.fit, metrics.deliverable)} on {metrics.fit.poses} fitted poses"
 
 

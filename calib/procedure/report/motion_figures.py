@@ -80,7 +80,7 @@ def _motion_figure(designed: Designed) -> Chart:
 
 
 def _path_figure(designed: Designed) -> Chart:
-    """Return the chart of the tool's path from above and from the side."""
+    """Return a chart of the tool's path, seen from above and from the side."""
     position = sweep(designed.inputs.chain, _dense_motion(designed).q).position
     panels = []
     for axis, title in ((1, "the tool's path from above"), (2, "from the side")):
@@ -147,12 +147,12 @@ def plan_figures(planned: Planned) -> dict[str, Chart]:
 
 
 def write_design(designed: Designed, folder: Path) -> None:
-    """Write the figures of a designed motion into its folder."""
+    """Write the figures of a designed motion as PNG into a folder."""
     save_all(design_figures(designed), folder)
 
 
 def write_plan(planned: Planned, folder: Path) -> None:
-    """Write the figures of a planned motion into its folder."""
+    """Write the figures of a planned motion as PNG into a folder."""
     save_all(plan_figures(planned), folder)
 
 

@@ -48,8 +48,7 @@ def write_model(outcome: IdentificationOutcome, folder: Path, plots: bool = True
         folder: folder of the identification.
         plots: whether to draw figures.
         pages: whether to write everything but the friction figure; a session's certificate step does this later, with
-            the
-            held-out recordings.
+            the held-out recordings.
     """
     from calib.procedure.dynamic_stage.folder import UnseenFolder
     from calib.procedure.report import dynamics_section

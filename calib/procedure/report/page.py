@@ -172,7 +172,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Pictures:
-    """Figures side by side."""
+    """Figures that are shown side by side."""
 
     title: str
     pictures: Sequence[Picture]

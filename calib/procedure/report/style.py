@@ -1,8 +1,7 @@
 """Common style of all figures: colours that are distinguishable in greyscale, light axes, PNG with a colour palette.
 
 Margins are those of matplotlib's constrained layout. Text is never interpreted as mathematics, so that a ``$`` in a
-name
-is printed as a ``$``.
+name is printed as a ``$``.
 """
 
 import io

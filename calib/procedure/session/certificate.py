@@ -68,7 +68,7 @@ def certify(session: Session, say: Say) -> list[str]:
 
 
 def pages(session: Session) -> tuple[Certificate, Page]:
-    """Return certificate and report of a session."""
+    """Return certificate and report of a session as records, which are rendered as HTML and PDF."""
     stages = []
     metrics = None
     if session.geometric:
@@ -173,7 +173,12 @@ def _arrival_notes(session: Session, folder: str, step: str) -> list[str]:
 
 
 def _with_arrival(stage: StageRecord, lines: list[str]) -> StageRecord:
-    """Return a stage's content with a list of those notes on input files that its section does not contain yet."""
+    """Return the content on a stage, with notes on input files added to the report section.
+
+    Args:
+        stage: content of report and certificate on the stage.
+        lines: the notes; those that the section already contains are omitted.
+    """
     blocks = stage.section.blocks
     present: set[str] = set()
     for block in blocks:
@@ -320,7 +325,7 @@ def listed(session: Session) -> list[FileRow]:
 
 
 def _archive(session: Session) -> list[Path]:
-    """Return the files that the certificate lists, the most important ones first."""
+    """Return the paths of the files that the certificate lists, the most important ones first."""
     exported = sorted(path for path in session.path(session.export).glob("*") if path.is_file())
     exported.sort(key=lambda path: path.name != URDF)
     paths = [*exported[:1], session.robot_file]

@@ -367,7 +367,7 @@ def status_lines(folder: Path) -> Iterator[RenderableType]:
 
 
 def noted(folder: Path) -> list[str]:
-    """Return the notes of each completed step of a session."""
+    """Return the notes of all completed steps of a session, each beginning with the name of the step."""
     lines = []
     for name, record in read_state(open_session(folder)).steps.items():
         lines += [f"  {name}: {note}" for note in record.notes]

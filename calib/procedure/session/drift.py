@@ -70,8 +70,7 @@ class Trend:
         unit: unit of the column's values: h or °C.
         x: (m,) time from the start, or temperature, at the measurements of repeated poses [unit].
         moved: (m, 3) measured points minus the arm's prediction and minus the mean of each pose [m], in the
-            instrument's
-            frame.
+            instrument's frame.
         poses: number of repeated poses.
         span: range of the column over all rows [unit].
         slope: (3,) rate of the target's motion [m per unit].

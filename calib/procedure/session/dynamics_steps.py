@@ -93,7 +93,7 @@ def excite(session: Session, say: Say) -> list[str]:
 
 
 def _training_settings(session: Session) -> ExcitationSettings:
-    """Return the settings of the training motion."""
+    """Return the settings for the design of the training motion, from ``session.toml``."""
     section = session.settings.dynamics
     return ExcitationSettings(
         period=section.period,

@@ -138,7 +138,8 @@ class Session:
         return older if older.exists() else self.folder / name
 
     def named(self, name: str) -> Path | None:
-        """Return the path of the file that a key of ``session.toml`` names; None if the key is empty."""
+        """Return the path of a file whose name is the value of a key in ``session.toml``; None if the value is empty.
+        """
         return self.path(name) if name else None
 
     @property
@@ -214,7 +215,7 @@ class Session:
 
     @property
     def identification(self) -> IdentificationFolder:
-        """Folder of the identification."""
+        """Folder with the results of the identification."""
         return IdentificationFolder(self.folder / "8-dynamics")
 
     @property
@@ -224,7 +225,7 @@ class Session:
 
     @property
     def concluded(self) -> bool:
-        """Whether the session has a verdict."""
+        """Whether the session has a verdict, because the step export has been completed."""
         return self.path(VERDICT).exists()
 
     def write_state(self, state: StateFile) -> None:

@@ -186,8 +186,7 @@ def _options_of(session: Session, paths: Sequence[Path] = ()) -> FitOptions:
     """Return the fit options, completed by the session's instrument and pose lists.
 
     Files without a stated σ get the instrument's σ. Files in `paths` that contain no joint values are assigned the
-    session's
-    list of planned poses.
+    session's list of planned poses.
     """
     options = read_options(session.named(session.settings.fit.options))
     by_file = dict(options.files)
@@ -364,7 +363,7 @@ def _fit_settings(session: Session) -> FitSettings:
 
 
 def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
-    """Return the inputs of the fit: robot, measurements, and the given validation files."""
+    """Return the inputs of the fit: robot, measurements, and the validation files in `validate`."""
     measured = session.brought("measured")
     links = session.links
     # the same links whatever joints the files' columns name

@@ -214,7 +214,11 @@ def checked(answers: Answers) -> FieldValues:
 
 
 def _payload(text: str) -> tuple[str, float]:
-    """Return label and mass [kg] of a payload given as ``label=kg``."""
+    """Return label and mass [kg] of a payload given as text ``label=kg``.
+
+    Raises:
+        UsageError: for another form, or an impossible mass.
+    """
     label, _, mass = text.partition("=")
     try:
         value = float(mass.removesuffix("kg"))
@@ -356,8 +360,7 @@ def _turned(name: str, most: float, text: str, answers: dict[str, str]) -> dict[
     """Return the placement (xyz, rpy) of a camera or board, given as a position and the direction that it faces.
 
     The z axis of a camera is along its viewing direction, and the z axis of a board is opposite to the direction that
-    it
-    faces.
+    it faces.
 
     Args:
         name: ``carried`` (on the arm) or ``stands`` (fixed).

@@ -110,7 +110,7 @@ class UserFiles:
     optional: bool = False
 
     def paths(self, session: Session) -> list[Path]:
-        """Return the paths of the files, including those in folders."""
+        """Return the paths of the files, including files in folders that the user provided."""
         return session.files_brought(self.kind)
 
 

@@ -65,8 +65,7 @@ def pdf(page: Certificate) -> tuple[bytes, list[str]]:
     """Return a certificate as PDF, and notes for the user.
 
     A certificate above `MAX_PAGES` pages, which only very long entries cause, is set in smaller type. The PDF is empty
-    in a
-    process forked from one that has used Typst, since Typst's threads do not exist after a fork.
+    in a process forked from one that has used Typst, since Typst's threads do not exist after a fork.
     """
     if _first_user() != os.getpid():
         return b"", [f"{PAGES[1]} was not written, since this process was forked: start processes by spawn"]
