@@ -1,4 +1,5 @@
-"""Shared parts of the commands: options from function signatures, console output, progress, check of the output folder.
+"""Shared parts of the commands: options from function signatures, console output, progress, check
+of the output folder.
 """
 
 from __future__ import annotations

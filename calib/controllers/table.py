@@ -72,7 +72,8 @@ class Controller:
         return np.array(self.signs or [1] * n)[:, None] * coupling
 
     def shown(self, q: np.ndarray) -> np.ndarray:
-        """Return a description's joint values q (…, n) [rad] as the controller displays them, in the controller's unit.
+        """Return a description's joint values q (…, n) [rad] as the controller displays them, in
+        the controller's unit.
         """
         return q @ self.matrix(q.shape[-1]).T / ANGLES[self.unit]
 

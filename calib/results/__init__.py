@@ -1,2 +1,3 @@
-"""Results, read from the folders or files that commands wrote: one protocol for all kinds, and scenes for the viewer.
+"""Results, read from the folders or files that commands wrote: one protocol for all kinds, and
+scenes for the viewer.
 """

@@ -127,7 +127,8 @@ class ErrorSizes:
 
 @dataclass(frozen=True, eq=False)
 class Played:
-    """A motion, with name, times t (N,) [s], joint values q (N, n) [rad or m], and velocities v (N, n); None: unknown.
+    """A motion, with name, times t (N,) [s], joint values q (N, n) [rad or m], and velocities v (N,
+    n); None: unknown.
     """
 
     name: str

@@ -161,7 +161,8 @@ def _errors(folder: Path, chain: Chain | Drawn | None) -> tuple[list[Measured], 
 
 
 def _measured(folder: Path, chain: Chain | Drawn | None) -> Measured:
-    """Return the measured positions in ``residuals.csv``, with the predictions of the nominal and the calibrated arm.
+    """Return the measured positions in ``residuals.csv``, with the predictions of the nominal and
+    the calibrated arm.
     """
     if isinstance(chain, Drawn):
         return Measured(*chain.measured(folder))
@@ -255,7 +256,8 @@ def _joint_values(table: Table, cell: Installation) -> np.ndarray:
 
 
 def _triples(table: Table, head: str, dimension: str) -> np.ndarray:
-    """Return three columns of a table, named `head` followed by x, y, z, as an array (m, 3) in SI; NaN for empty cells.
+    """Return three columns of a table, named `head` followed by x, y, z, as an array (m, 3) in SI;
+    NaN for empty cells.
     """
     return np.column_stack([table.numbers(f"{head}{axis}", dimension, gaps=True) for axis in "xyz"])
 
@@ -318,7 +320,8 @@ def _motions(folder: Path) -> list[Played]:
 
 
 def _all_torques(folder: Path, chain: Chain | Drawn | None) -> list[Torques]:
-    """Return the measured and predicted torques in a folder and its subfolders; only held-out motion if there is any.
+    """Return the measured and predicted torques in a folder and its subfolders; only held-out
+    motion if there is any.
     """
     result = []
     for path in _below(folder, "torques_*.csv"):
@@ -382,7 +385,8 @@ def _model_rows(model: dict, chain: Chain | Drawn, count: int) -> tuple[tuple[st
 
 
 def _below(folder: Path, pattern: str) -> list[Path]:
-    """Return the files that match a pattern in a folder and in subfolders down to two levels, the folder's files first.
+    """Return the files that match a pattern in a folder and in subfolders down to two levels, the
+    folder's files first.
     """
     paths = []
     for subfolders in ("", "*/", "*/*/"):

@@ -262,7 +262,8 @@ class Processes:
         )
 
     def settled(self) -> Iterator[Answer]:
-        """Yield the answers of tasks that end after Ctrl-C; worker processes that did not receive it are interrupted.
+        """Yield the answers of tasks that end after Ctrl-C; worker processes that did not receive
+        it are interrupted.
         """
         self.stopping = True
         for patience in (GRACE, 2 * GRACE):
@@ -295,7 +296,8 @@ class Processes:
 
 
 def _serve(pipe: connection.Connection) -> None:
-    """Run the calls that a worker process receives, until the pipe is closed; Ctrl-C has an effect only during a call.
+    """Run the calls that a worker process receives, until the pipe is closed; Ctrl-C has an effect
+    only during a call.
     """
     heard = list[int]()
 

@@ -73,7 +73,8 @@ Numbers = Annotated[tuple[float, ...], Expect("a list of finite numbers")]
 
 @dataclass(frozen=True)
 class _JointTable:
-    """Entry ``[[joint]]`` of ``trajectory.toml``: coefficients of one joint; the module's docstring explains the keys.
+    """Entry ``[[joint]]`` of ``trajectory.toml``: coefficients of one joint; the module's docstring
+    explains the keys.
     """
 
     name: Name

@@ -54,7 +54,8 @@ class DesignCondition:
     normalised_before: float | None = None
 
     def table(self) -> dict[str, float]:
-        """Return the entry ``condition_number`` of ``metrics.json``: name of a condition number -> value, without None.
+        """Return the entry ``condition_number`` of ``metrics.json``: name of a condition number ->
+        value, without None.
         """
         return {name: value for name, value in asdict(self).items() if value is not None}
 

@@ -171,7 +171,8 @@ def _write_setpoints(track: Setpoints, bounds: MotionBounds, path: Path) -> Path
 
 
 def _write_approach_and_rehearsal(motion: Playback | Planned, bounds: MotionBounds, folder: Path) -> None:
-    """Write the setpoints of approach and rehearsal, if the motion has them, as ``approach.csv`` and ``rehearsal.csv``.
+    """Write the setpoints of approach and rehearsal, if the motion has them, as ``approach.csv``
+    and ``rehearsal.csv``.
     """
     if motion.approach is not None:
         _write_setpoints(motion.approach, bounds, folder / APPROACH)

@@ -221,7 +221,8 @@ def known_sigmas(inputs: ExcitationInputs, task: Task) -> tuple[tuple[np.ndarray
 
 
 def _information_root(inputs: ExcitationInputs) -> np.ndarray:
-    """Return a square root W (c, c) of the earlier motions' information matrix Wᵀ W, for the c columns of the design.
+    """Return a square root W (c, c) of the earlier motions' information matrix Wᵀ W, for the c
+    columns of the design.
     """
     assert inputs.prior is not None
     columns = inputs.columns.kept

@@ -91,7 +91,8 @@ class Inputs:
 
     @property
     def bare(self) -> Chain | None:
-        """Geometry of an earlier fit for use without its joint corrections; None if the earlier fit has no corrections.
+        """Geometry of an earlier fit for use without its joint corrections; None if the earlier fit
+        has no corrections.
         """
         if self.earlier is None or self.earlier.corrections is None:
             return None

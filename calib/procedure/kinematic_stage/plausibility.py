@@ -184,7 +184,8 @@ def findings(
 
 
 def _as_positions(block: PoseMeasurements) -> PoseMeasurements:
-    """Return a block of measurements; images are replaced by board poses, whose scale is that of the board's squares.
+    """Return a block of measurements; images are replaced by board poses, whose scale is that of
+    the board's squares.
     """
     if not isinstance(block, Pixels):
         return block
@@ -197,7 +198,8 @@ def _as_positions(block: PoseMeasurements) -> PoseMeasurements:
 def _wrong_columns(
     nominal: Installation, blocks: Sequence[PoseMeasurements], before: float, reach: float
 ) -> list[Finding]:
-    """Return a finding if the nominal arm explains the rows after a change of columns or rows; otherwise an empty list.
+    """Return a finding if the nominal arm explains the rows after a change of columns or rows;
+    otherwise an empty list.
     """
     if not before > FLOOR * reach:
         return []

@@ -138,7 +138,8 @@ class Session:
         return older if older.exists() else self.folder / name
 
     def named(self, name: str) -> Path | None:
-        """Return the path of a file whose name is the value of a key in ``session.toml``; None if the value is empty.
+        """Return the path of a file whose name is the value of a key in ``session.toml``; None if
+        the value is empty.
         """
         return self.path(name) if name else None
 
