@@ -5,12 +5,12 @@ measured torque: it is the identified model, on which the torque not explained b
 
     M(q) a + … = tau + (tau_model(q_r, v_r, a_r) - tau_measured), tau = feedback + feedforward,
 
-where the reference (q_r, v_r, a_r) is the filtered recorded motion. A robot that follows the reference needs tau =
-tau_measured. Four feedforwards are compared: none; the inertias of the robot's description (CAD) without friction; the
-complete identified model; and the measured torque, whose tracking error is the least that the control period allows. On
-held-out motion, the whole model error acts as the disturbance, although the simulated robot is the model. The
-simulation does not contain disturbances that depend on the path (they are replayed by time), elastic joints, or
-additional functions of the real controller. The noise of the torque sensors is replayed as a disturbance; feedback
+where the reference (q_r, v_r, a_r) is the filtered recorded motion. A robot that follows the reference needs exactly
+the torque tau_measured. Four feedforwards are compared: none; the inertias of the robot's description (CAD) without
+friction; the complete identified model; and the measured torque, whose tracking error is the least that the control
+period allows. On held-out motion, the whole model error acts as the disturbance, although the simulated robot is the
+model. The simulation does not contain disturbances that depend on the path (they are replayed by time), elastic joints,
+or additional functions of the real controller. The noise of the torque sensors is replayed as a disturbance; feedback
 suppresses most of it.
 
 Estimates are often physically inconsistent (such as a small negative wrist inertia). Then the smallest sufficient motor

@@ -7,8 +7,8 @@ explains, a log of R independent rows per joint yields the base parameters with 
 
 and the torque of another motion with the variance Y C Yᵀ. On a calibrated robot, an error g of the geometry, which is
 equal in all logs, adds to both (`calib.identification.uncertainty.geometry_uncertainty`). It changes the parameters by
-S g = -C Σ Yᵀ (∂Y/∂g φ) g / σ², with earlier motions by C (C_before⁻¹ S_before g - …), and the torques by Y S g + (∂Y/∂g
-φ) g. A design minimises only the part from torque errors.
+S g = -C Σ Yᵀ (∂Y/∂g φ) g / σ², with earlier motions by C (C_before⁻¹ S_before g - …), and the torques by
+Y S g + (∂Y/∂g φ) g. A design minimises only the part from torque errors.
 
 R is the number of rows that `calib identify` uses: twice the identification band, computed from the accelerations by
 the rules of the identification. Before a log exists, σ_j is unknown: it consists of noise, and of friction that no term

@@ -431,9 +431,7 @@ def table(chosen: Chosen) -> list[tuple[str, str]]:
 
 
 def predicted_rows(chosen: Chosen) -> list[tuple[str, str]]:
-    """Return table rows (label, text) on the predicted accuracy, and on the accuracy lost by line-of- sight
-    constraints.
-    """
+    """Return table rows (label, text) on the predicted accuracy, and on the accuracy lost by lines of sight."""
     outlook = chosen.outlook
     rows = forecast.table(outlook.poses, outlook.others)
     if outlook.blind is None:

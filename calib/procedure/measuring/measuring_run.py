@@ -241,9 +241,10 @@ def plan_run(
 def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
     """Return the poses (m, n) with each revolute joint's angles moved by whole turns into one interval of 360°.
 
-    A joint with a range above 360° reaches some angles at several joint values. To keep moves short, the interval
-    begins in the middle of the largest gap between the poses' angles if this gap exceeds 30°; otherwise half a turn
-    below the middle of the joint's range. An angle that would leave the joint limits remains unchanged.
+    Joints with a range of up to 360° are not changed. Other joints reach some angles at several joint values. To keep
+    moves short, the interval begins in the middle of the largest gap between the poses' angles if this gap exceeds 30°;
+    otherwise half a turn below the middle of the joint's range. An angle that would leave the joint limits remains
+    unchanged.
     """
     full = 2 * np.pi
     result = q.copy()

@@ -30,9 +30,12 @@ ROUNDS = "rounds.json"
 
 
 def largest_move(before: Path, after: Path) -> float:
-    """Return the largest |Δ| / σ between the parameters in two result folders.
+    """Return the largest change of a parameter between two result folders, in units of the parameter's σ.
 
-    Infinite if the parameters have other names, or if the first folder has no estimate.
+    Infinite if the folders have other parameters, or if the first folder has no estimate.
+
+    Args:
+        before, after: folders with ``estimate.csv``.
     """
     if not (before / ESTIMATE).is_file():
         return float("inf")
@@ -48,9 +51,12 @@ def largest_move(before: Path, after: Path) -> float:
 
 
 def return_masses(session: Session) -> list[str]:
-    """Copy the identified masses to where the fit reads them, if they would still change the fit; return notes.
+    """Copy the identified masses into the folder from which the fit reads them, if they would still change the fit.
 
     Nothing is done unless the fit has compliance or sag. After copying, the session's fit is repeated.
+
+    Returns:
+        Notes for the user.
     """
     limit = session.settings.fit.rounds
     record_path = session.path(MASSES)
