@@ -81,7 +81,8 @@ def judge(
     2. if only frames were requested: the tolerance, or ``frames-only`` (not judged) without a tolerance;
     3. if the calibrated arm is as good as the nominal one (within `MIN_GAIN`): ``nothing-to-gain`` (pass) if the
        error is below `FLOOR` times the reach, ``transfer-untested`` if no station could be held out as a whole,
-       otherwise ``no-better-model``; also a pass if the nominal arm's error is smaller than any instrument's (`TOO_GOOD`);
+       otherwise ``no-better-model``; also a pass if the nominal arm's error is smaller than any instrument's
+       (`TOO_GOOD`);
     4. ``worse-than-nominal``; from cross-validation only, if both errors are below `FLOOR` times the reach,
        ``keep-nominal``, since the nominal arm may have been fitted to these rows;
     5. ``no-unseen-poses``;
