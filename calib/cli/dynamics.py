@@ -1,4 +1,4 @@
-"""Commands for dynamics: excite, recall, identify, and plan (motions)."""
+"""Commands for dynamics: excite, recall and identify; and plan, for motions."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated

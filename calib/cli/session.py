@@ -1,4 +1,4 @@
-"""Commands of the guided session: new, next, status, redo; formats and explain."""
+"""Commands of the guided session: new, next, status, redo; and formats and explain."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -59,7 +59,11 @@ def new(
 
 
 def _completed(answers: Answers) -> Answers:
-    """Return the answers completed by questions at a terminal."""
+    """Return the answers completed by questions at a terminal.
+
+    Raises:
+        UsageError: if answers are missing and there is no terminal.
+    """
     import sys
 
     from calib.procedure.session.questions import QUESTIONS, with_answer

@@ -1,4 +1,7 @@
-"""Answers to `calib new`, given as options or at a terminal. This module imports little: `calib` starts fast."""
+"""Answers to the questions of `calib new`, as command options or from a terminal.
+
+This module imports only small modules, so that `calib` starts fast.
+"""
 
 from dataclasses import dataclass, field
 from datetime import date
@@ -20,7 +23,13 @@ MAX_LETTERS = 200
 
 
 def _entry(value: object) -> object:
-    """Check an entry of a certificate (a text, number or date), and return it as a text of one line."""
+    """Return an entry of a certificate (text, number or date) as one line of printable text.
+
+    Other values are returned unchanged.
+
+    Raises:
+        ValueError: for a text that is too long.
+    """
     if not isinstance(value, str | int | float | date) or isinstance(value, bool):
         return value
     # control characters and halves of surrogate pairs cannot be printed
@@ -37,7 +46,8 @@ StatedEntry = Annotated[Text, Checked(_entry, {"type": ["string", "number"]})]
 @strict
 @dataclass(frozen=True)
 class CertificateSection:
-    """Section ``[certificate]``: what the certificate states besides results; empty: a line to fill in by hand.
+    """Section ``[certificate]``: information on the certificate besides results; empty: a blank line to fill in by
+    hand.
 
     Attributes:
         certificate_number: certificate number
@@ -135,5 +145,5 @@ class Answers:
 
     @property
     def cell(self) -> dict[str, str | tuple[str, ...]]:
-        """Answers about the measuring cell: option name -> answer; questions without an answer are absent."""
+        """Answers about the measuring cell: option name -> answer; unanswered questions are absent."""
         return {name: value for name in CELL if (value := getattr(self, name)) is not None}

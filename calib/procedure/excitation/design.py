@@ -1,4 +1,7 @@
-"""Design of exciting motions: passes a robot's regressor and limits to the package `trajectories`."""
+"""Design of exciting motions for identification, by the optimisation in the package `trajectories`.
+
+This module supplies a robot's regressor and limits to the optimisation.
+"""
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -40,9 +43,9 @@ from calib.workers import finishing
 class DesignCondition:
     """Condition numbers of the observation matrix: raw (SI units), and normalised (columns of unit norm).
 
-    With earlier motions, `raw` and `normalised` are those of all motions together, `…_alone` those of the new motion,
-    and `…_before` those of the earlier motions; None without earlier motions, or where the columns are not all
-    determined.
+    With earlier motions, `raw` and `normalised` apply to all motions together, `…_alone` to the new motion, and
+    `…_before` to the earlier motions. `…_alone` and `…_before` are None without earlier motions, or if the motions by
+    themselves do not determine all columns.
     """
 
     raw: float
@@ -53,7 +56,9 @@ class DesignCondition:
     normalised_before: float | None = None
 
     def table(self) -> dict[str, float]:
-        """Return the values as the entry ``condition_number`` of ``metrics.json``."""
+        """Return the entry ``condition_number`` of ``metrics.json``: name of a condition number ->
+        value, without None.
+        """
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
@@ -70,16 +75,16 @@ END_EVALUATIONS = 300
 
 @dataclass(frozen=True, eq=False)
 class Designed:
-    """A designed exciting motion, with its inputs, goals reached, and verified margins to the limits.
+    """A designed exciting motion, with its inputs, reached goals, and verified margins to the limits.
 
     Attributes:
         inputs, settings: inputs and settings of the design.
         problem: optimisation problem that was solved last, with the family of motions.
         found: the motion.
-        proof: margins of the motion to the limits, checked independently.
+        proof: margins of the motion to the limits, checked independently of the optimisation.
         condition: condition numbers at `INSTANTS` samples over the period, without additional smoothing of Coulomb
             friction.
-        goals: stated goals: name, requested value, weight, and reached value (by `exact` of the inputs' model).
+        goals: stated goals: name, requested value, weight, and value reached without additional smoothing of friction.
         front: trade-offs between goals; None if not requested.
         stored_front: the front with its motions, as the folder keeps it; None without a front.
         playback: setpoints for the controller.
@@ -115,12 +120,12 @@ class Designed:
 
     @property
     def period(self) -> float:
-        """The motion's period [s]."""
+        """Period of the motion [s]."""
         return self.family.period * self.found.factor
 
     @property
     def locked(self) -> dict[str, float]:
-        """Positions of the locked joints, by joint name [rad or m]."""
+        """Positions of the locked joints: joint name -> value [rad or m]."""
         last = self.playback.run.q[-1]
         return {self.inputs.chain.joint_names[j]: float(last[j]) for j in self.inputs.locked}
 
@@ -142,9 +147,11 @@ def excite(
     """Design a motion that excites the dynamics of a robot within its limits.
 
     Without goals, the logarithms of both condition numbers, raw and normalised, are minimised with equal weights; an
-    aim such as ``logdet`` replaces them. With goals (``wrist=0.1``), the condition numbers become goals, too: their
-    goal values are those reached by a first single-objective search (the study's advice), unless the settings state
-    them.
+    aim such as ``logdet`` replaces them. With goals (``wrist=0.1``), the condition numbers become goals, too. Unless
+    the settings state their goal values, these are the values reached in a first search for the condition numbers alone
+    (as the study advises).
+
+    Ctrl-C ends the search; the best motion found until then is verified and returned.
 
     Args:
         robot, base, tip: see `calib.robot.library`.
@@ -155,9 +162,7 @@ def excite(
         after: folder of an identification whose recordings the motion shall complement; replaces `model`.
         picked: front of an earlier design with the same settings, whose designed motion is taken instead of a search.
         map: function that runs the starts of the search, possibly in parallel (`calib.workers`).
-        progress: called with the name of each step; None: silent.
-
-    Ctrl-C ends the search; the best motion found so far is verified and returned.
+        progress: called with a text on each step; None: silent.
 
     Raises:
         UsageError, MeasurementError: for a file that cannot be read, or belongs to another robot.
@@ -171,7 +176,7 @@ def excite(
 
 
 def _silent(stage: str) -> None:
-    """Show no progress."""
+    """Ignore a progress text."""
 
 
 def search_motion(
@@ -287,8 +292,9 @@ def _periodic(motion: SearchResult, inputs: ExcitationInputs, settings: Excitati
 def _reached(
     problem: ExcitationProblem, goals: Sequence[AttainmentGoal], result: SearchResult, inputs: ExcitationInputs
 ) -> tuple[float, ...]:
-    """Return the goals' values (one per goal) that a motion reaches at `INSTANTS`, without smoothing of Coulomb
-    friction.
+    """Return the value of each goal that a motion reaches at `INSTANTS` samples.
+
+    Coulomb friction is not smoothed additionally.
     """
     if not goals:
         return ()
@@ -313,8 +319,10 @@ def _instants(family: Family, motion: SearchResult) -> np.ndarray:
 def _excitation_problem(
     inputs: ExcitationInputs, settings: ExcitationSettings
 ) -> tuple[ExcitationProblem, tuple[MotionConstraint, ...], tuple[str, ...]]:
-    """Return the optimisation problem (objectives, limits, family), the constraints to verify, and notes for the
-    user.
+    """Return the optimisation problem of a design, the constraints for its verification, and notes for the user.
+
+    Raises:
+        UsageError: for a shortest period above the period.
     """
     constraints, checked, notes = _constraints(inputs.model, inputs.limits)
     condition = _condition_objective(inputs, settings)
@@ -339,7 +347,11 @@ def _excitation_problem(
 def _with_whole_samples(
     motion: SearchResult, problem: ExcitationProblem, rate: float
 ) -> tuple[SearchResult, ExcitationProblem]:
-    """Return (motion, problem), both with the period rounded to whole controller samples."""
+    """Return motion and problem with the period increased to a whole number of controller samples.
+
+    Args:
+        rate: rate of the controller [Hz].
+    """
     if not problem.free_period:
         return motion, problem
     samples = problem.family.period * rate
@@ -348,7 +360,7 @@ def _with_whole_samples(
 
 
 def _condition_objective(inputs: ExcitationInputs, settings: ExcitationSettings) -> Excitation:
-    """Return the objective: condition number of the identifiable columns, including earlier motions."""
+    """Return the condition number of the identifiable columns as an objective, including earlier motions."""
     existing = None
     if inputs.prior is not None:
         existing = inputs.prior.per_sample(settings.samples, settings.repeat * settings.period)
@@ -359,8 +371,10 @@ def _condition_objective(inputs: ExcitationInputs, settings: ExcitationSettings)
 def _searched(
     problem: ExcitationProblem, goals: Sequence[AttainmentGoal], starts: int, search: Search, show: Progress
 ) -> tuple[SearchResult, ExcitationProblem]:
-    """Return the motion and the problem solved; if goals need it, a first search sets the condition numbers' goal
-    values.
+    """Return the motion that a search finds, and the optimisation problem that was solved.
+
+    If there are goals, but none for the condition numbers, a first search without goals determines the goal values of
+    the condition numbers.
     """
     has_condition_goal = any(isinstance(goal.objective, Excitation) for goal in goals)
     if not goals or has_condition_goal:
@@ -386,8 +400,11 @@ def _searched(
 def _condition_of(inputs: ExcitationInputs, family: Family, result: SearchResult, repeat: int = 1) -> DesignCondition:
     """Return the condition numbers at `INSTANTS` samples over the period, without smoothing of Coulomb friction.
 
-    With earlier motions they are those of all motions together; `…_alone` and `…_before` are those of the new motion
-    and of the earlier motions by themselves.
+    Args:
+        inputs: robot, model and earlier motions.
+        family: family of motions.
+        result: the motion.
+        repeat: number of periods that are run.
     """
     columns = inputs.columns
     motion = dense_motion(family, result.x, _instants(family, result), result.factor)
@@ -409,15 +426,19 @@ def _condition_of(inputs: ExcitationInputs, family: Family, result: SearchResult
 
 
 def _finite(condition: float) -> float | None:
-    """Return a condition number; None where a motion by itself does not determine all columns."""
+    """Return a condition number; None if it is infinite, since a motion does not determine all columns."""
     if np.isfinite(condition):
         return condition
     return None
 
 
 def _family(inputs: ExcitationInputs, settings: ExcitationSettings) -> tuple[Family, Family | None]:
-    """Return the family of motions, and the family with fewer harmonics for the first search stage; None without
-    one.
+    """Return the family of motions, and a family with fewer harmonics for the first stage of the search.
+
+    The second family is None for splines, or if the first has few harmonics.
+
+    Raises:
+        UsageError: for an unknown family.
     """
     fixed = {j: value for j, value in inputs.locked.items() if value is not None}
     resonance, harmonics = inputs.limits.resonance, settings.harmonics
@@ -443,7 +464,10 @@ def _family(inputs: ExcitationInputs, settings: ExcitationSettings) -> tuple[Fam
 def _constraints(
     dynamics: ExcitedModel, limits: MotionLimits
 ) -> tuple[tuple[MotionConstraint, ...], tuple[MotionConstraint, ...], tuple[str, ...]]:
-    """Return the constraints for the search, those for the verification (Coulomb sign not smoothed), and notes."""
+    """Return the constraints for the search, the constraints for the verification, and notes for the user.
+
+    Constraints for the verification use the sign function of Coulomb friction without additional smoothing.
+    """
     values = dynamics.values
     if values is None or not np.isfinite(limits.torque).any():
         return limits.constraints, limits.constraints, ()
@@ -480,9 +504,9 @@ def _nearest_goals(
     designed: tuple[SearchResult, Verification],
     checked: tuple[MotionConstraint, ...],
 ) -> tuple[Front, SearchResult, Verification]:
-    """Return the front, and the motion nearest to the goals, verified, among the front's motions and the designed one.
+    """Return the front, and the motion nearest to the goals with its verified margins.
 
-    Without goals, the designed motion is returned.
+    Candidates are the designed motion and the motions of the front. Without goals, the designed motion is returned.
     """
 
     def distance(motion: SearchResult) -> float:
@@ -509,12 +533,10 @@ def _front(
     evaluations: int,
     report: Callable[[int, int, str], None],
 ) -> Front:
-    """Return the trade-offs by the ε-constraint method: torque goal from rest to its best value, versus condition
-    number.
+    """Return the trade-offs between condition number and a torque goal, by the ε-constraint method.
 
-    The torque goal is the first one stated (default: wrist); the condition number is the first among the goals
-    (default:
-    the normalised one, or the aim).
+    The torque goal is varied from its value at rest to its best value. It is the first torque goal in the settings
+    (default: wrist). The condition number is the first one among the goals (default: the normalised one, or the aim).
     """
     slacks = [goal.objective for goal in goals if isinstance(goal.objective, TorqueSlack)]
     slack = slacks[0] if slacks else torque_slack(wrist(inputs.chain.n), inputs, "front")

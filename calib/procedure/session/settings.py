@@ -1,6 +1,7 @@
 """Settings of a session, ``session.toml``: robot, instrument, poses, fit and dynamics.
 
-Lengths in m, angles in rad. Every key, what it may be, its default and its comment stand here and nowhere else.
+Lengths are in m, angles in rad. The dataclasses of this module define every key with its allowed values, default and
+comment.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -68,7 +69,11 @@ _HEAD = (
 
 
 def _beside(value: object) -> object:
-    """Check that a name is a valid relative path, and return it."""
+    """Return a value unchanged after a check that a text is a relative path, which is next to ``session.toml``.
+
+    Raises:
+        ValueError: for an absolute or too long path.
+    """
     if not isinstance(value, str):
         return value
     if PurePath(value).is_absolute() or len(value) > MAX_NAME or "\0" in value:
@@ -102,7 +107,7 @@ class RobotSection:
 @strict
 @dataclass(frozen=True)
 class InstrumentSection:
-    """Section ``[instrument]``: the instrument, and its sigmas.
+    """Section ``[instrument]``: the measuring instrument, and its σ.
 
     Attributes:
         name: what it is called
@@ -267,10 +272,10 @@ class SessionSettings:
 
 
 def read_settings(path: Path) -> SessionSettings:
-    """Read ``session.toml``; missing keys get their defaults, and schema 1 gets no dynamics.
+    """Read ``session.toml``; missing keys get their defaults, and files of schema 1 get no dynamics.
 
     Raises:
-        SessionError: if it was made by a newer version, is damaged, or has an invalid value.
+        SessionError: if the file was made by a newer version, is damaged, or has an invalid value.
     """
     table = read_toml(path, SessionError)
     check_schema(path, table.get("schema"))
@@ -285,10 +290,11 @@ def read_settings(path: Path) -> SessionSettings:
 
 
 def check_schema(path: Path, schema: object) -> None:
-    """Raise an error for a schema number that this version cannot read.
+    """Raise a SessionError, with advice, if this version cannot read the schema of a session's file.
 
-    Raises:
-        SessionError: with advice.
+    Args:
+        path: the file, for the message.
+        schema: the schema number in the file; None: the file has no such number.
     """
     if schema in READABLE_SCHEMAS and type(schema) is int:
         return
@@ -303,14 +309,14 @@ def check_schema(path: Path, schema: object) -> None:
 
 
 def default_keys(section: str) -> dict[str, object]:
-    """Return the defaults of a section by key; empty for a key outside sections."""
+    """Return the default values of a section of ``session.toml`` by key; empty if there is no such section."""
     kind = get_type_hints(SessionSettings).get(section)
     keys = fields(kind) if is_dataclass(kind) else ()
     return {key.name: key.default for key in keys if key.default is not MISSING}
 
 
 def written(settings: SessionSettings) -> str:
-    """Return the text of ``session.toml`` with these settings, including a comment for every key."""
+    """Return the text of ``session.toml`` for the given settings, with a comment for every key."""
     lines = [f"# {line}" for line in _HEAD]
     lines.append(f"schema = {settings.schema}")
     lines += _lines(settings)
@@ -318,7 +324,7 @@ def written(settings: SessionSettings) -> str:
 
 
 def _lines(section: "DataclassInstance | type[DataclassInstance]", prefix: str = "") -> Iterator[str]:
-    """Yield the lines of a section, with the comments of keys aligned in one column, and tables last."""
+    """Yield the lines of a section: first keys with comments aligned in one column, then tables."""
     comments = described(type(section))
     tables = []
     for key in fields(section):
