@@ -203,7 +203,7 @@ def _design(
         notes += [Note(f"{name}: {doubt}", is_warning=True) for doubt in designed.doubts]
         if designed.front is not None:
             count = len(designed.front.values)
-            choose = command_line("next", "--pick", "N", session.folder)
+            choose = command_line("next", session.folder, "--pick", "N")
             table = session.path("6-excitation/training/front.csv")
             notes.append(Note(f"{name}: {count} motions to choose from ({table}): {choose}", is_warning=True))
         remarks = [*designed.inputs.limits.bounds.lines()]

@@ -15,11 +15,13 @@ from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
-from calib.errors import SessionError, require
+from calib.config import parse
+from calib.errors import SessionError, command_line, require
 from calib.extensions import Point
 from calib.files import fingerprint
 from calib.folders import COVARIANCE, ESTIMATE, METRICS, REPORT
 from calib.identification.model_file import MODEL
+from calib.identification.settings import Payload, mass_as_payload
 from calib.procedure.excitation.coefficients import NAME as MOTION
 from calib.procedure.findings import Note
 from calib.procedure.kinematic_stage.folder import URDF
@@ -195,7 +197,19 @@ IDENTIFY_OPTIONS = NamedFile("dynamics", "options")
 # keys of [dynamics] on which the identified model depends
 MODEL_KEYS = ("torques", "friction", "method", "options", "payloads", "holdout")
 # and those of a designed motion
-DESIGN_KEYS = ("plan", "validation", "period", "harmonics", "rate", "starts", "evaluations", "limits")
+DESIGN_KEYS = (
+    "plan",
+    "validation",
+    "period",
+    "harmonics",
+    "rate",
+    "goals",
+    "hard",
+    "front",
+    "starts",
+    "evaluations",
+    "limits",
+)
 STEPS = (
     SessionStep(
         "describe",
@@ -493,10 +507,13 @@ def _comparable(name: str, mark: str) -> object:
         return mark
     section, _, key = name.removeprefix(f"{folder.SETTINGS} [").partition("]")
     value = json.loads(mark)
+    if key.strip() == "payloads":
+        # records of older sessions state masses alone
+        return {label: parse(Payload, mass_as_payload(payload), name) for label, payload in value.items()}
     if key and mark != "{}":
         value = {key.strip(): value}
     if isinstance(value, dict):
-        return default_keys(section) | value
+        return json.loads(json.dumps(default_keys(section))) | value
     return value
 
 
@@ -534,7 +551,11 @@ def run_instead(session: Session, step: SessionStep, make: Make, say: Say, progr
     for state in states(session):
         if state.step.name == step.name:
             break
-        require(state.kind in (DONE, KEPT), f"first complete the step {state.step.name}", SessionError)
+        require(
+            state.kind in (DONE, KEPT),
+            f"first complete the step {state.step.name}: {command_line('next', session.folder)}",
+            SessionError,
+        )
     kinds, reason = step.kept
     require(not session.brought(*kinds), f"step {step.name}: {reason}", SessionError)
     _run(session, replace(step, make=make), say, progress, command)
@@ -542,7 +563,7 @@ def run_instead(session: Session, step: SessionStep, make: Make, say: Say, progr
 
 def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: str) -> None:
     """Run a step, record it in ``state.json``, and print its notes."""
-    number = steps_of(session).index(step) + 1
+    number = [included.name for included in steps_of(session)].index(step.name) + 1
     recorded = read_state(session).without(step.name)
     session.write_state(replace(recorded, running=step.name))
     # files that change while the step runs make it stale
