@@ -15,13 +15,13 @@ from .errors import BadInput, require
 
 @dataclass(frozen=True, eq=False)
 class BSpline:
-    """Family of periodic splines as joint motions.
+    """Family of joint motions as periodic splines.
 
     Attributes:
         period: T0 [s].
-        counts: (n,) control points C of each joint; 1 holds the joint at a constant.
+        counts: (n,) number C of control points of each joint; 1 locks the joint at a constant value.
         degree: degree of the polynomial pieces.
-        freedoms: for each joint, the control points that satisfy its equations.
+        freedoms: for each joint, the control points that satisfy the equations of rest and start value.
     """
 
     period: float
@@ -43,7 +43,7 @@ class BSpline:
         return joined(self.freedoms, x)
 
     def variables(self, coefficients: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the variables (p,) whose control points are nearest to the given ones."""
+        """Return the variables (p,) whose control points are nearest to the given control points."""
         return projected(self.freedoms, coefficients)
 
     def evaluate(self, x: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
@@ -65,8 +65,8 @@ class BSpline:
     def largest(self, x: np.ndarray, order: int) -> np.ndarray:
         """Return a bound (n,) on abs(d^r q / dt^r): the largest control point of the r-th derivative.
 
-        The derivative of a uniform spline has control points Δc / h one degree lower (de Boor), and a spline lies in
-        the hull of its control points.
+        The derivative of a uniform spline is a spline one degree lower with control points Δc / h (de Boor), and a
+        spline lies in the convex hull of its control points.
         """
         bounds = []
         for count, points in zip(self.counts, self.coefficients(x)):
@@ -77,7 +77,9 @@ class BSpline:
         return np.array(bounds)
 
     def random(self, rng: np.random.Generator, centre: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
-        """Return variables (p,) of a random motion about `centre` (n,), control points spread by `amplitude` (n,)."""
+        """Return the variables (p,) of a random motion about `centre` (n,); `amplitude` (n,) spreads its control
+        points.
+        """
         points = []
         for count, middle, size in zip(self.counts, centre, amplitude):
             points.append(middle + size * rng.normal(size=count))
@@ -95,10 +97,10 @@ def bspline_family(
     held: Mapping[int, float] | None = None,
     rate: float | None = None,
 ) -> BSpline:
-    """Return the family of periodic splines with `points` control points (one number, or (n,); 1 locks a joint).
+    """Return the family of periodic splines with the given numbers of control points.
 
     Args:
-        points: control points of all joints, or of each joint; more than the degree, or 1.
+        points: number of control points, one number for all joints or (n,); more than the degree, or 1 to lock a joint.
         period, joints, rest, start, held, rate: as for `calib.trajectories.fourier.fourier_family`.
         degree: 5 or more, so that the jerk has no kinks.
 
@@ -131,7 +133,7 @@ def bspline_family(
 
 
 def _table(times: np.ndarray, period: float, count: int, degree: int) -> np.ndarray:
-    """Return the derivatives (4, N, count) of q, v, a, jerk with respect to the control points."""
+    """Return the derivatives (4, N, count) of q, v, a, jerk at times (N,) with respect to the control points."""
     result = np.zeros((4, len(times), count))
     if count == 1:
         result[0] = 1.0

@@ -1,4 +1,4 @@
-"""Speed along a path: profiles s(t) with s̈ constant between grid points, so that x = ṡ² is linear in s there."""
+"""Speed along a path: profiles s(t) with s̈ constant between grid points, where x = ṡ² is therefore linear in s."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Profile:
 
     @property
     def u(self) -> np.ndarray:
-        """Path acceleration s̈ (K,) between grid points: Δx / (2 Δs)."""
+        """Path acceleration s̈ (K,) on each interval: Δx / (2 Δs)."""
         steps = np.diff(self.s)
         return np.diff(self.x) / (2 * steps)
 
@@ -69,7 +69,7 @@ class Sampled:
     Attributes:
         s: (N,) path parameters of the samples.
         weights: (N,) duration that each sample represents [s]; they sum to the duration of the motion.
-        q, v, a, tau: (N, n) joint values, velocities, accelerations, torques; tau is None without a torque law.
+        q, v, a, tau: (N, n) joint values, velocities, accelerations, torques; tau is None where no torque law is given.
     """
 
     s: np.ndarray
@@ -81,9 +81,11 @@ class Sampled:
 
 
 def dense(path: Path, profile: Profile, torque: TorqueLaw | None, per_interval: int = 8) -> Sampled:
-    """Return the motion of a profile, sampled on each interval with both ends: s̈ and friction jump between intervals.
+    """Return the motion of a profile, sampled densely on each interval.
+    Both ends of an interval are samples, since s̈ and friction jump between intervals.
 
-    At rest friction takes the direction of the motion that begins or ends there, which gives the larger torque.
+    At rest, friction has the direction of the motion that begins or ends at this instant, which gives the larger
+    torque.
     """
     share = np.linspace(1e-6, 1 - 1e-6, per_interval)
     steps = np.diff(profile.s)[:, None]
@@ -113,9 +115,10 @@ def moved(path: Path, s: np.ndarray, speed: np.ndarray, u: np.ndarray) -> tuple[
 
 
 def track(path: Path, profile: Profile, rate: float, torque: TorqueLaw | None = None) -> Setpoints:
-    """Return the motion as setpoints at a controller's rate [Hz]; its duration must be a whole number of samples.
+    """Return the motion as setpoints at a controller's rate [Hz].
 
-    Torques at rest are those just after the start and just before the end.
+    The duration must be a whole number of samples. Torques at rest are those just after the start and just before the
+    end. They are None without a torque law.
     """
     count = round(profile.duration * rate)
     times = np.arange(count + 1) / rate
