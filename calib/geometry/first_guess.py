@@ -426,10 +426,11 @@ def guess(
 def _place_position(
     arm: np.ndarray, measured: np.ndarray, station: np.ndarray | None, tool: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return station S and target position t that solve y_i = S (R_i t + a_i) linearly; a given one is kept.
+    """Return station S and target position t that solve y_i = S (R_i t + a_i); a placement that is given is kept.
 
-    Where the workspace is small, the linear solution is inaccurate. Two simpler guesses are therefore also computed:
-    the target at the tip, and at the tip with the mean offset. The guess with the smallest median error is returned.
+    If both are unknown, they are computed alternately: S by Kabsch's method, t as the median offset. The iteration
+    starts from t = 0 and from the linear solution, which is inaccurate in a small workspace. The result with the
+    smallest median error is returned.
 
     Args:
         arm: (m, 4, 4) poses A_i of the tip in the base.

@@ -119,7 +119,7 @@ def sigma_at(cell: Installation, fit: GeometricFit, q: np.ndarray) -> np.ndarray
 
 
 def _posterior(cell: Installation, fit: GeometricFit, columns: np.ndarray) -> np.ndarray:
-    """Return the posterior covariance (c, c) of the parameters `columns` (c,), given a fit's data and the prior of
+    """Return the posterior covariance (c, c) of the parameters `columns` (c,), from a fit's data and the prior of
     making.
     """
     square = np.zeros((len(columns), len(columns)))
