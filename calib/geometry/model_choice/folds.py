@@ -86,8 +86,7 @@ def divide(
         blind: (count,) mask of the folds to split.
         measured: blocks of measurements.
         seed: seed of the regions.
-        scattered: True splits at random, so that each part holds out every third row, for folds whose regions cannot be
-            predicted either.
+        scattered: True splits at random into three parts, for folds whose regions cannot be predicted either.
     """
     members = [np.array(fold) for fold in folds.members]
     count = 0
