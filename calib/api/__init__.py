@@ -1,1 +1,3 @@
-"""Implementation of the Python API: functions for the stages, and results that print themselves."""
+"""Implementation of the Python API: functions for the stages of a calibration, and result classes with console
+output.
+"""
