@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from calib.results.result import Result
     from calib.robot.calibrated import CalibratedChain
 
-# what `import calib` offers, and where it lives: loaded when first asked for, so that `calib --help` starts at once
+# names that `import calib` provides, and their modules, which are loaded at first use to keep `calib --help` fast
 _HOMES = {
     "api.reading": ("load", "read_poses", "read_recording"),
     "api.kinematic": ("select_poses", "fit_geometry", "PoseSelection", "GeometryFit"),

@@ -18,7 +18,7 @@ from calib.errors import CalibError, brief
 
 # Exit code of an internal error.
 CODE = 4
-# Where a report goes; README says the same and, once there is a public address, Issues of [project.urls].
+# Address for reports, also in README and, once it is public, under Issues of [project.urls].
 TRACKER = "the issue tracker of the repository you cloned (git remote -v)"
 PACKAGES = ("armature-calib", "numpy", "scipy", "numba", "pin", "pydantic", "typer", "matplotlib", "clarabel")
 

@@ -16,10 +16,10 @@ from calib.errors import Finding, finding
 
 Data = TypeVar("Data")
 
-# Ratio of the residuals of two changes up to which nobody can tell which of them it is (our choice).
+# Largest ratio of the residuals of two changes that cannot be distinguished (our choice).
 MAX_RIVAL_RATIO = 1.2
-# Ratio up to which two changes explain the data equally but for rounding: a wrist joint's zero off by 180° reverses the
-# joint behind it. The change that stands first in the table counts (our choice).
+# Largest ratio of the residuals of two changes that differ by rounding only: a wrist joint's zero off by 180° has the
+# same effect as reversing the joint after it. The first change in the table is then chosen (our choice).
 MAX_TIE_RATIO = 1.0001
 
 

@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 # A TOML file, or its content.
 Tables = str | Path | Mapping[str, object]
-# Levels of tables in tables, and bytes of a file (our choices).
+# Largest number of levels of nested tables, and largest size of a file in bytes (our choices).
 MAX_LEVELS = 32
 MAX_BYTES = 8_000_000
-# Expected types, by pydantic's names of errors.
+# Descriptions of expected types, by pydantic's names of errors.
 _PLAIN = {
     "float": "a number",
     "int": "a whole number",
@@ -38,10 +38,10 @@ _PLAIN = {
     "tuple": "a list",
     "too_short": "at least one number",
 }
-# Stands in a field's description for the texts that it may hold instead of its default.
+# Placeholder in a field's description, replaced by the texts that are allowed besides the default.
 OTHERS = "{others}"
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
-# Entry of a docstring: names, and their description.
+# Pattern of an entry in a docstring: names, and their description.
 _ENTRY = re.compile(r"^ {4}(\w+(?:, \w+)*): (.*(?:\n {8}.*)*)", re.M)
 
 

@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 ParsedTable: TypeAlias = dict[str, Any]
 """A table of a TOML or JSON file as its parser returns it; who reads a value checks it."""
 
-# Pydantic's name of the error.
+# Pydantic's name of the error for an unknown key.
 UNKNOWN = "unexpected_keyword_argument"
-# Signs of an expression (our choice).
+# Largest number of characters of an expression (our choice).
 MAX_LETTERS = 200
-# Class of an operation, as `ast` has it, and its function of two values.
+# Class of an operation in `ast`, with its function of two values.
 Operations = Mapping[type[ast.operator], Callable[[Any, Any], Any]]
 _BINARY: Operations = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv}
 _NAMES = {"pi": math.pi, "inf": math.inf}

@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     import numpy as np
 
 T = TypeVar("T")
-# Errors of a write, whatever the file.
+# Errors of writing that do not depend on the file, such as a full disk.
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO)
-# Share of common letters from which on a name is suggested.
+# Smallest similarity (0 to 1) of a name that is suggested.
 SIMILAR = 0.6
-# Exit codes of wrong input, and of data that determine no result.
+# Exit codes for wrong input, and for data that do not determine a result.
 USAGE_CODE = 2
 NO_RESULT_CODE = 3
 

@@ -28,11 +28,11 @@ from calib.records import plain, shielded
 if TYPE_CHECKING:  # the commands' help is written without loading it
     import numpy as np
 
-# By which figures and recordings are known as ours.
+# Name of the program in the metadata of figures and recordings, by which its own files are recognised.
 MAKER = "armature-calib"
-# SHA-256 of the results in a folder, by name, as they were written.
+# File with the SHA-256 of each result in a folder when it was written, by file name.
 RESULTS = ".armature-calib.json"
-# Rows that are written at a time: of tables of anything, and of numbers.
+# Number of rows that are written at once: of general tables, and of tables of numbers.
 TABLE_CHUNK = 1000
 NUMBERS_CHUNK = 10_000
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 FieldValues: TypeAlias = dict[str, Any]
 """Values of fields of a record by name, to be passed on as keywords."""
-# What a spreadsheet's formula begins with, and our own mark.
+# Characters with which a spreadsheet's formula begins, and the apostrophe that `shielded` adds.
 _FORMULA = ("=", "+", "-", "@", "\t", "\r", "'")
 
 

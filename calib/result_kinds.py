@@ -55,7 +55,7 @@ def _members(archive: Path) -> list[str]:
 _SHOWN = "calib view {folder} shows it, calib export {folder} --into DIR writes the robot for other programs"
 _NOT_A_SESSION = {"session": "not a session; " + _SHOWN}
 
-# In the order of recognition: a session also holds fits, an identification also a robot.
+# In the order in which they are tested: a session also contains fits, an identification also a robot.
 KINDS = (
     ResultKind(
         "session",
@@ -96,7 +96,7 @@ KINDS = (
 )
 BY_NAME = {kind.name: kind for kind in KINDS}
 
-# What each verb takes, in words. `robot` stands for every command that takes a robot.
+# Description of what each command accepts. `robot` is the entry for every command that takes a robot.
 TAKES = {
     "certificate": "the folder of a fit or of an identification",
     "compensate": "the folder of a fit, or of a session that has one",

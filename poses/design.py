@@ -14,8 +14,8 @@ import numpy as np
 
 from .information import log_det
 
-# information added to every design, relative to the unit mean information of one candidate, so that sets without full
-# rank can be compared (our choice); values reported to the user never contain it
+# multiple of the identity matrix (the mean information of one candidate) added to every design, so that sets without
+# full rank can be compared (our choice); values reported to the user do not contain it
 RIDGE = 1e-6
 
 

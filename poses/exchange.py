@@ -7,10 +7,10 @@ import numpy as np
 
 from .design import Design, Pool, best_addition, best_removal, design_of, with_added, with_removed
 
-# called with each design of the requested size that is better than all before
+# function called with each design of the requested size that is better than all before
 Report = Callable[[Design], None]
 
-# smallest gain of log det that counts (our choice)
+# smallest gain of log det that is treated as an improvement (our choice)
 TOLERANCE = 1e-9
 
 

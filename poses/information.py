@@ -8,7 +8,7 @@ from scipy.linalg import solve_triangular
 
 from .errors import BadInput, NotIdentifiable, TooFewCandidates, require
 
-# smallest accepted ratio of singular values of the column-scaled candidates (our choice; Gram matrices see 1e-8)
+# smallest accepted ratio of singular values of the column-scaled candidates (our choice; Gram matrices resolve 1e-8)
 RANK_TOLERANCE = 1e-7
 
 

@@ -27,9 +27,9 @@ from .convex import information_of, relaxed, scores_of
 from .information import log_det, prepared
 from .space import SearchSpace, is_feasible, product
 
-# poses optimised together: few for a fast SLSQP, many for an efficient Jacobian (our choice)
+# number of poses optimised together: few for a fast SLSQP, many for an efficient Jacobian (our choice)
 BLOCK = 8
-# poses that differ by less in all joints are one start [rad or m] (our choice)
+# poses that differ by less in all joints are treated as one start [rad or m] (our choice)
 MIN_DIFFERENCE = 0.1
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from .basis import SampledMotion
 
-# [m] by which a limit on the distance from the axis is divided at least
+# smallest radius by which the limit on the distance from the axis is divided [m]
 MIN_RADIUS = 1e-3
 
 

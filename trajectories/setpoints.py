@@ -10,7 +10,7 @@ import numpy as np
 
 from .errors import BadInput, require
 
-# of a joint [rad or m] at a seam between two tracks
+# largest jump of a joint between two tracks [rad or m]
 MAX_JUMP = 1e-6
 
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from .errors import BadInput
 
-# starts of a tour that may begin anywhere, about (our choice)
+# approximate number of starts tried for a tour that may begin at any pose (our choice)
 STARTS = 12
 
 

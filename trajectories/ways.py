@@ -12,11 +12,11 @@ import numpy as np
 
 Clear = Callable[[np.ndarray], np.ndarray]
 
-# largest step of a tree in one joint, as a share of its unit (see `Room`; our choice)
+# largest step of a tree in one joint, as a share of the joint's unit in `Room` (our choice)
 MAX_STEP = 0.5
-# share of random places near the middle between the ends (our choice)
+# share of random poses that are drawn near the middle between the ends (our choice)
 MIDDLE_SHARE = 0.1
-# attempts to remove a detour, and length that a straight move must have at most, relative to the detour
+# number of attempts to remove a detour, and largest length of a straight move relative to the detour it replaces
 SHORTENINGS = 60
 MAX_SHORTENED = 0.98
 

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 Progress = Callable[[str], None]
 DataFrame: TypeAlias = Any
 """A pandas DataFrame; pandas is there for those who ask for data frames."""
-# Letters of a line of text.
+# number of characters of a line of text
 WIDTH = 120
 
 

@@ -31,28 +31,28 @@ from calib.geometry.weighing import GeometricFit, Settings
 from calib.records import evenly
 from calib.robot.chain import Chain, element_length
 
-# [m]: shorter lengths, and growth that moves targets by less per unit, say nothing of a factor
+# smallest length of the arm [m], and smallest motion of targets per unit growth [m], that determine a scale factor
 MIN_LENGTH = 0.01
-# rows below which no pattern is looked for (our choice)
+# smallest number of rows in which patterns are searched (our choice)
 MIN_ROWS = 30
-# probability that the same rows in another order show such a change of set-up (our choice)
+# largest probability of such a difference by chance, for rows in any order, to report a changed set-up (our choice)
 MAX_CHANCE = 1e-3
-# a set-up's errors over those of the other rows from which on it is worth a finding (our choice)
+# smallest ratio of the errors before and after a change of set-up that is reported (our choice)
 MIN_RATIO = 1.6
-# what neighbouring poses differ by, over the residuals, below which these are systematic (our choice)
+# residuals are systematic if those of neighbouring poses differ by less than this share of them (our choice)
 MAX_NEIGHBOUR_SHARE = 0.6
-# factor between residuals and a stated uncertainty from which on it is worth a finding (our choice)
+# ratio of residuals to stated uncertainty, or the inverse, above which a finding is reported (our choice)
 MAX_TIMES = 5.0
-# angles beyond a convention's range were lost
+# a robust fit, since orientations with angles beyond the range of a convention were lost
 ROBUST = Settings(loss="cauchy", limit=40, passes=4)
-# of the makers' angles; others are rare (our choice)
+# conventions for orientation angles that robot makers use; others are rare (our choice)
 CONVENTIONS = ("vector", "xyz fixed", "xyz moving", "zyx fixed", "zyx moving", "zyz moving", "zxz moving")
-# share of the error that may remain where no second change goes with it, and of a joint's sign (our choice)
+# largest share of the error that may remain after a change made alone, and after reversing a joint's sign (our choice)
 MAX_LEFT = 1.0 / 3.0
 MAX_LEFT_SIGN = 0.8
-# rows of each block by which changes are compared (our choice)
+# number of rows of each block by which changes are compared (our choice)
 FEW = 200
-# other zeros of a joint that are tried [rad]
+# offsets of a joint's zero that are tried [rad]
 QUARTERS = (np.pi / 2.0, -np.pi / 2.0, np.pi)
 # signs of the axes of a frame of opposite handedness
 FLIP = np.array([1.0, -1.0, 1.0])

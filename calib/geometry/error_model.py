@@ -39,17 +39,17 @@ from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain
 from calib.robot.kinematics import forward
 
-# share of the poses at each end of a joint's range that is left out (our choice)
+# share of the poses that is held out at each end of a joint's range (our choice)
 END_SHARE = 0.2
-# share of the poses within the distance from a joint's range (our choice)
+# share of the fitted poses that define a joint's range near a pose (our choice)
 NEAR_SHARE = 0.02
-# poses from which errors on held-out rows are worth a model (our choice)
+# smallest number of poses for an error model (our choice)
 MIN_POSES = 20
-# poses that folds are judged by (our choice)
+# largest number of poses by which folds are evaluated (our choice)
 MAX_POSES = 1500
-# what is known beforehand of a parameter that a fold does not tell [m, rad] (our choice)
+# prior standard deviation of a parameter without prior, for folds that do not determine it [m, rad] (our choice)
 PRIOR_SIGMA = 1.0
-# poses and step [rad or m] by which a joint's lever is measured, and the least lever [m/rad or 1]
+# number of poses and step [rad or m] by which a joint's lever is computed, and the smallest lever [m/rad or 1]
 LEVER_POSES = 50
 LEVER_STEP = 1e-4
 MIN_LEVER = 0.05

@@ -45,21 +45,22 @@ OPTICS: "Point[Callable[[Sequence[object]], Optics]]" = Point(
     "optics", "optics of kinds that are not the core's; loading it registers guesses and residuals"
 )
 
-# what a turn counts as [m/rad] (our choice)
+# length by which rotations are multiplied to compare them with displacements [m/rad] (our choice)
 LEVER = 0.3
-# rounds of rotation and offset, and of placement and offset
+# number of alternations between rotation and offset, and between placement and offset
 PLACING_ROUNDS = 5
-# rms turn of the target [rad] below which it tells no offset
+# smallest rms rotation of the target [rad] that determines its offset
 MIN_TURN = 0.01
-# rows by which orientations are checked, and fewest of them (our choice)
+# largest and smallest number of rows by which orientations are checked (our choice)
 CHECKED_ROWS = 200
 MIN_CHECKED_ROWS = 4
-# median misfit [deg] from which on a file's orientations are not what they are said to be (our choice)
+# smallest median misfit of orientations [deg] that contradicts their stated convention (our choice)
 MIN_ANGLE = 20.0
-# median misfits of another reading that explains them: an angle [deg], and a share of the positions' spread
+# largest median misfits of the reading that explains the orientations: an angle [deg], and a share of the
+# positions' spread
 MAX_ANGLE = 5.0
 MAX_MISFIT = 0.1
-# readings of orientations that are tried: what to tell the user, and order and signs of the quaternions as read
+# readings of orientations that are tried: text for the user, and order and signs of the quaternions as read
 READINGS = (
     (
         "read as w x y z they agree. If w comes first, name the columns in that order: qw, qx, qy, qz",
@@ -72,7 +73,7 @@ READINGS = (
         [-1, -1, -1, 1],
     ),
 )
-# questions about units by the factor of measured over predicted lengths
+# for each ratio of measured to predicted lengths, the question about units for the user
 UNITS = {
     1e3: "are they mm, although the header states m",
     1e-3: "are they m, although the header states mm",
@@ -82,18 +83,19 @@ UNITS = {
     25.4: "are they mm, although the header states in",
     0.03937: "are they inches, although the header states mm",
 }
-# no joint goes further: they may be rad read as deg (our choice)
+# largest joint angle for which values in rad may have been read as deg (our choice)
 MAX_TURN = 2.1 * math.pi * DEG
-# measured over predicted spread of the positions (our choice)
+# largest ratio of measured to predicted spread of positions, or of the inverse (our choice)
 MAX_RATIO = 15.0
-# spread of predicted positions from which they are held against the measured ones [m] (our choice)
+# smallest spread of predicted positions for which it is compared with that of the measured ones [m] (our choice)
 MIN_SPREAD = 1e-3
-# steps in which the turning of poses counts, and turning from which a tool is told well anyway [rad] (our choice)
+# steps in which rotations of poses are compared, and rotation that determines a tool well in any case [rad]
+# (our choice)
 TURN = 0.05
 TURNED = 6.0
-# rows of a block that a guess is made from (our choice)
+# largest number of rows of a block from which a guess is made (our choice)
 MAX_GUESS_ROWS = 300
-# share of the points of an alignment that are trusted, and how many at least
+# share of the points that an alignment uses, and their smallest number
 TRUSTED_SHARE = 0.8
 MIN_TRUSTED = 4
 

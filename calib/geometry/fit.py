@@ -33,29 +33,29 @@ from calib.geometry.weighing import GeometricFit, Settings, Weigher
 from calib.robot.calibrated import Deflection
 from calib.robot.chain import Chain, element_length
 
-# How far a parameter of a real arm may be from its nominal by making: one standard deviation (our choice)
+# standard deviation of a manufactured arm's parameter from its nominal value, by unit (our choice)
 PLAUSIBLE = {"m": 0.01, "rad": 0.05}
-# widths of making of a usual arm: what one more parameter would say (our choice)
+# the same for a typical arm; it enters the estimate of the widths as one more parameter (our choice)
 TYPICAL = {"m": 3e-3, "rad": 5e-3}
-# measured numbers per unknown at least (our choice)
+# smallest number of measured numbers per unknown (our choice)
 MIN_NUMBERS = 1.5
-# fits with new widths of making, which then change by less than their uncertainty
+# number of fits with new widths of making; afterwards the widths change by less than their uncertainty
 WIDTH_UPDATES = 2
-# of WᵀW with its diagonal scaled to 1; its root of columns
+# relative rounding error of WᵀW with its diagonal scaled to 1; for columns of W its square root
 ROUNDING = 1e-12
-# of the fixed point of the widths between two fits
+# largest number of fixed-point iterations of the widths between two fits
 WIDTH_ROUNDS = 30
-# share of its largest coefficient from which a parameter counts as merged with another
+# a parameter depends on another if its coefficient is at least this share of its largest coefficient
 MERGED = 0.1
 # relative deviation of a column's coefficients from those of a common scale (our choice)
 SCALE_DEVIATION = 0.2
-# poses with which the fit of many more begins, and that widths are estimated from (our choice)
+# number of poses with which a fit of many more poses begins, and from which widths are estimated (our choice)
 WARM_POSES = 2000
-# passes at most until the noise of images settles (our choice)
+# largest number of passes until the noise of images converges (our choice)
 IMAGE_PASSES = 20
-# linearisations after which a placement that has not settled does not tell itself (our choice)
+# number of linearisations after which a placement that has not converged is poorly determined (our choice)
 CRAWLS = 60
-# relative size of a column of a placement that a block hardly tells (our choice)
+# relative size of a placement's column below which a block hardly determines the direction (our choice)
 MIN_COLUMN = 1e-3
 
 

@@ -19,21 +19,21 @@ from calib.geometry.installation import Installation, Seen, see
 from calib.robot.calibrated import evaluate
 from calib.robot.kinematics import joint_jacobian
 
-# error [m] below which a target is met
+# error [m] below which a target is reached
 DONE = 1e-10
-# damping, in mean squared singular values of J
+# first damping, in units of the mean squared singular value of J
 FIRST = 1e-9
 LAST = 1e4
-# step [rad or m] that changes nothing
+# step [rad or m] below which the iteration ends
 MIN_STEP = 1e-12
-# [m]: an orientation counts as its displacement at this distance (our choice, as all constants here)
+# length [m] by which orientations are multiplied to compare them with positions (our choice, as all constants here)
 LEVER = 0.3
-# weights that hold the joints at the start [m/rad], and steps with each
+# weights μ of the joints' distance from the start [m/rad], and number of steps with each
 BACK = np.geomspace(1e-4, 1.0, 13)
 HELD_STEPS = 20
-# passes towards the joint values to stay near
+# largest number of passes towards the nearest joint values
 NEAREST_PASSES = 8
-# targets at once: bounds the memory
+# number of targets computed at once, which limits the memory
 CHUNK = 2000
 
 Torques = Callable[[np.ndarray], np.ndarray] | None

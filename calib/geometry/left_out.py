@@ -31,36 +31,37 @@ from scipy.special import ndtri
 from calib.estimation.relevance import SETTLED, Gram, gram, relevance
 from calib.estimation.robust import ROUNDS, variance_weights
 
-# values per joint, linear in between (our choice)
+# number of values of a joint's function, which is linear between them (our choice)
 KNOTS = 9
-# how far one value speaks for others, of the range (our choice)
+# correlation length of a joint's function, as a share of the joint's range (our choice)
 CORRELATION_LENGTH = 0.5
-# how far the function is stated outside the range, of it (our choice)
+# extension of the function beyond each end of the range, as a share of the range (our choice)
 KNOT_MARGIN = 0.2
-# of the median squared error: smaller ones count as that (our choice)
+# squared errors are raised to this share of their median (our choice)
 MIN_SQUARE = 0.02
-# variance of a logarithm that is known best: copies of few poses would be fitted without any error
+# smallest variance of a logarithm: without it, copies of few poses would be fitted without any error
 MIN_VARIANCE = 1e-4
-# a joint that moves by less tells nothing [rad or m]
+# smallest motion of a joint for which its function is estimated [rad or m]
 MIN_MOTION = 1e-3
-# a_j that the search begins with, and its rounds
+# initial a_j of the search, and largest number of its iterations
 FIRST_SIZE = 0.5
 SEARCH_ROUNDS = 30
-# share of the errors that an interval holds
+# share of the errors that an interval has to contain
 COVERED = 0.95
-# share of an end's excess that lasts beyond it, and standard deviation of the rest, of logarithms (see above)
+# LASTING and CHANGE of the module's docstring: share of an end's excess that persists beyond it, and standard
+# deviation of the remaining change, both of logarithms
 LASTING = 0.5
 CHANGE = 0.33
-# rows of a kind that the poses outside a fold must have to tell an interval (our choice)
+# smallest number of rows of each kind outside a fold to estimate an interval (our choice)
 MIN_ROWS = 5
-# ends of ranges that tell what is common to them (our choice)
+# smallest number of held-out ends of ranges to estimate their mean (our choice)
 MIN_ENDS = 3
-# rounds of the search for variances without a fold's poses
+# largest number of iterations of the search for variances without a fold's poses
 FOLD_ROUNDS = 100
-# [m²] of an expected squared error, at least
+# smallest expected squared error [m²]
 SMALLEST_VARIANCE = 1e-30
 
-# per joint: its values, log s there
+# for each joint: joint values, and log s at these values
 Profile = tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]
 
 

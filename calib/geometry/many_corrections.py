@@ -19,9 +19,9 @@ from calib.geometry.observation import Block, layout_counts, observe, pieces, pr
 from calib.geometry.residuals import ResidualPart
 from calib.robot.calibrated import target_elements
 
-# corrections of one element from which on it pays to multiply elements first (our choice)
+# number of corrections of one element above which multiplying elements first is faster (our choice)
 MANY = 30
-# poses at once: their bases stay in the processor's cache
+# number of poses computed at once, so that their basis functions fit into the processor's cache
 CHUNK = 500
 
 

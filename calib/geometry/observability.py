@@ -22,25 +22,25 @@ from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import element_jacobian, forward, joint_jacobian, twist_product
 from calib.transforms import pose, to_quaternion
 
-# ratio of a parameter's σ to that of its prior from which the data say little of it (our choice)
+# ratio of a parameter's σ to that of its prior above which the data hardly determine it (our choice)
 NEAR_PRIOR = 0.7
-# share of its largest coefficient from which a parameter counts as merged with another (our choice)
+# a parameter depends on another if its coefficient is at least this share of its largest coefficient (our choice)
 MIN_SHARE = 0.1
-# parameters by which families of merged ones are distinguished
+# largest number of parameters named to distinguish groups of dependent parameters
 MAX_NAMED = 4
-# [m] a placement known no better than this is worth a finding (our choice)
+# standard deviation of a tool's position above which a finding is reported [m] (our choice)
 MAX_PLACEMENT_SIGMA = 2e-3
-# [deg] below it "the wrist is held still" is the likely reason (our choice)
+# range of orientations [deg] below which a still wrist is the likely reason (our choice)
 MIN_ORIENTATION_RANGE = 45.0
-# canonical correlation of a tool's and a station's placement from which they are confused (our choice)
+# canonical correlation of a tool's and a station's placement above which they cannot be separated (our choice)
 MAX_CORRELATION = 0.95
-# [m] of an arm, at least
+# smallest typical length of an arm [m]
 MIN_REACH = 0.1
-# kinds of measurement that poses are selected for
+# kinds of measurement for which poses can be selected
 KINDS = (Poses.kind, Positions.kind)
-# random postures that decide what is identifiable
+# number of random postures by which identifiable parameters are determined
 SAMPLES = 300
-# [m], [rad]: our choice where none is stated
+# default standard deviations of a position [m] and of an orientation [rad] (our choice)
 SIGMA_POSITION = 1e-4
 SIGMA_ORIENTATION = 1e-4
 PLACES = {"station": "the placement of the instrument", "tool": "the mounting of the tool"}

@@ -25,9 +25,9 @@ from calib.transforms import displace
 TERM_UNITS = {"torque": "/(N m)", "joint": "/rad"}
 FRAME_UNITS = ("m", "m", "m", "rad", "rad", "rad")
 KINDS = ("arm", "station", "tool", "optics", "deflection")
-# rows observed at once: the Jacobian of so many has 50 MB at 500 parameters (our choice)
+# number of rows evaluated at once: their Jacobian has 50 MB at 500 parameters (our choice)
 PIECE = 2000
-# poses whose sigmas are computed at once: the Jacobian has a column per parameter
+# number of poses whose sigmas are computed at once: the Jacobian has a column per parameter
 CHUNK = 500
 
 

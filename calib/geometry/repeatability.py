@@ -30,13 +30,13 @@ from calib.geometry.installation import Installation
 from calib.geometry.observation import Block, predict, prepare, rows_of
 from calib.records import stored
 
-# joints of one commanded pose, as read back, differ by less [rad or m] (our choice)
+# largest difference of joint values read back at one commanded pose [rad or m] (our choice)
 SAME = 1e-3
-# directions of approach that differ by more are different ones (our choice)
+# smallest angle between directions of approach that are treated as different (our choice)
 APART = np.radians(30.0)
-# cycles that make a repeated pose
+# smallest number of cycles of a repeated pose
 MIN_CYCLES = 3
-# of a validation file's rows that are the fit's: from there on it proves nothing (our choice)
+# largest share of a validation file's rows that may be rows of the fit, for the file to be used (our choice)
 MAX_COPIED_SHARE = 0.5
 ARMS = ("nominal", "calibrated")
 MeanAndMax = Mapping[str, float]

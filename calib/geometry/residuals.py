@@ -21,7 +21,7 @@ from calib.data.poses.measurements import Bars, Distances, Planes, PoseMeasureme
 from calib.errors import refuse_data
 from calib.geometry.installation import Seen
 
-# steps of Gauss–Newton for the centre of a bar, and length of the last one [m]
+# largest number of Gauss–Newton steps for the centre of a bar, and length of a step that ends them [m]
 CENTRE_STEPS = 20
 MIN_CHANGE = 1e-13
 

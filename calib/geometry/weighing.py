@@ -22,17 +22,17 @@ from calib.records import frozen
 from calib.robot.calibrated import CalibratedChain, CorrectedChain
 from calib.robot.chain import Chain
 
-# [m, rad, px] of estimated sigmas: no instrument of an arm is more exact, though computed positions are
+# smallest estimated sigma [m, rad, px]: no instrument is more accurate, though simulated positions are
 MIN_SIGMA = 1e-6
-# residuals over their sigmas: computed positions leave less
+# smallest ratio of residuals to their sigmas: those of simulated positions are smaller
 MIN_NOISE = 1e-6
-# [m, rad, px] sigmas that a fit begins with, by label of the residual part
+# initial sigmas of a fit by label of the residual part [m, rad, px]
 START_SIGMA = dict.fromkeys(("position", "orientation", "consistency", "distance", "plane"), 1e-3) | {"pixel": 0.3}
-# [m, rad, px] robust spread by which outliers are measured at least
+# smallest robust spread in units of which outliers are measured [m, rad, px]
 SMALLEST_SPREAD = 1e-15
-# share of the measured numbers that counts as free at least, however many unknowns there are
+# smallest share of degrees of freedom among the measured numbers, for any number of unknowns
 MIN_FREE_SHARE = 0.05
-# change of a weight, and relative change of a sigma, that repeats no fit
+# largest change of a weight, and largest relative change of a sigma, for which the fit is not repeated
 MAX_CHANGE = 0.02
 
 _NONE = np.array([], dtype=int)

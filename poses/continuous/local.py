@@ -20,9 +20,10 @@ Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
 # above this number of variables, poses are searched in blocks, the others fixed: SLSQP's cost is cubic
 MAX_BLOCK = 300
-# the stages of a smoothed search (our choice): at the last one the smoothing costs at most log(p)/1024 of the merit
+# sharpness of each stage of a smoothed search (our choice); in the last one the smoothed merit is at most log(p)/1024
+# below the merit itself
 SHARPNESS = (16.0, 64.0, 256.0, 1024.0)
-# iterations within which a stage must improve (our choice)
+# number of iterations within which the merit must improve for a stage to go on (our choice)
 PATIENCE = 25
 # largest accepted constraint violation in a result [unit of the constraint]
 FEASIBLE = 1e-8

@@ -19,7 +19,7 @@ from ..design.problem import ExcitationProblem, exact_values, stretched, unmet
 from ..design.search import STAGES, Method, SearchResult, Stage, Stuck, one_start
 from ..errors import BadInput, NotExciting, NothingFeasible, require
 
-# share of the starts which the last stages are for (our choice)
+# share of the starts for which the last stages are run (our choice)
 KEPT = 1 / 3
 
 

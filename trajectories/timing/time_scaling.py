@@ -24,13 +24,13 @@ from ..timing.path_limits import Law, TimingLimits
 from ..timing.profile import Profile, Sampled, dense, moved
 from ..timing.reachability import ConstraintRows, fastest
 
-# intervals: in all, between two knots where these are many, and at most
+# number of grid intervals: smallest in all, for each interval between two knots, and largest in all
 GRID = 400
 PER_SPAN = 200
 MAX_INTERVALS = 2400
-# of a limit: nearer than that it is active
+# a limit is active where the motion is nearer to it than this share of it
 ACTIVE = 0.01
-# rounds of reachability, and mean relative change of x at which friction counts as settled
+# largest number of rounds of reachability, and mean relative change of x below which friction has converged
 MAX_ROUNDS = 25
 MAX_CHANGE = 1e-4
 

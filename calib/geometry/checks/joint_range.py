@@ -26,11 +26,11 @@ from calib.geometry.observation import layout, pose_sigmas, positions, prepare, 
 from calib.geometry.weighing import GeometricFit
 from calib.robot.chain import random_joints
 
-# random postures by which a fit is judged over the whole range
+# number of random postures by which a fit is judged over the whole joint range
 POSTURES = 300
-# [rad, m]: a joint that moved by less stood; the others are drawn with it where it stood
+# a joint that moved by less was at rest [rad, m]; in random postures it keeps its measured value
 STILL = 1e-3
-# of the largest one: placements have no prior
+# smallest precision relative to the largest one, for placements, which have no prior
 MIN_PRECISION = 1e-12
 
 

@@ -14,11 +14,11 @@ from calib.errors import Finding, finding
 from calib.geometry.installation import Installation
 from calib.geometry.observation import positions, prepare
 
-# [m]: readings that differ by no more are one number; instruments have noise (our choice)
+# largest difference of readings [m] that are treated as equal; readings of an instrument have noise (our choice)
 SAME = 1e-8
-# [m] between predicted targets from which on one reading cannot be both (our choice)
+# distance between predicted targets [m] above which equal readings are impossible (our choice)
 MIN_APART = 1e-3
-# poses at which a target has the numbers of another (our choice)
+# smallest number of poses at which a copied target has the readings of another (our choice)
 MIN_COPIES = 3
 
 

@@ -32,31 +32,32 @@ from calib.geometry.observation import Block, layout, observe, parameter_values,
 from calib.geometry.weighing import GeometricFit
 from calib.records import evenly
 
-# of a block, and of its rows before and after a step the third part (our choice)
+# smallest number of rows of a block; a third of it is the smallest number before and after a step (our choice)
 MIN_ROWS = 20
-# of a block that are looked at (our choice)
+# largest number of rows of a block that are used (our choice)
 MAX_ROWS = 1500
-# that noise explains as much by one of the hypotheses: residuals are not quite white (our choice)
+# largest probability that noise has such a gain for any hypothesis; small, since residuals are not quite white
+# (our choice)
 MAX_CHANCE = 1e-6
-# of the rms that remains without the change (our choice)
+# largest rms with the change, as a share of the rms without it (our choice)
 MAX_LEFT = 0.75
-# the same on rows that did not determine the change (our choice)
+# the same share on held-out rows (our choice)
 MAX_LEFT_UNSEEN = 0.85
-# gain of the best change over another order, of that over the rows (our choice)
+# largest gain of a change over rows in another order, as a share of the gain in the order of the file (our choice)
 MAX_RIVAL = 0.5
-# that are searched for in one block
+# largest number of changes that are searched for in one block
 MAX_CHANGES = 3
-# times the median residual: rows that are measured wrongly, not of another set-up (our choice)
+# rows with residuals above this multiple of the median are outliers, not rows of another set-up (our choice)
 GROSS = 10.0
-# [m, rad] no instrument has less
+# smallest standard deviation of a reading [m, rad]
 MIN_NOISE = 1e-6
-# [m, rad] width of the prior of placements
+# prior standard deviation of placements [m, rad]
 FREE = 10.0
-# [m, rad] width of the prior of what changed while measuring
+# prior standard deviation of a change during the measurement [m, rad]
 CHANGED = 0.1
-# passes until no gross row leaves; more are seldom needed
+# largest number of passes that remove outliers
 GROSS_PASSES = 5
-# parts of the rows by which a change is tested on rows that did not determine it
+# number of parts of the rows, each of which is held out once to test a change
 FOLDS = 5
 STEPS = {"station": "station-changed", "target": "target-changed", "zero": "zero-changed", "scale": "scale-changed"}
 DRIFTS = {"station": "station-drifts", "target": "target-wanders", "zero": "zero-drifts", "scale": "scale-drifts"}

@@ -17,17 +17,17 @@ from calib.geometry.installation import Installation
 from calib.records import evenly
 from calib.robot.kinematics import forward
 
-# rows between a measurement and its joints: a lost point, a line of the header
+# shifts in rows between measurements and joint values that are tried, as by a lost point or a header line
 SHIFTS = (1, -1, 2, -2)
-# rows that are shifted at least (our choice)
+# smallest number of shifted rows (our choice)
 MIN_SHIFTED = 8
-# share of the rows whose shifted joints are there, not held out (our choice)
+# smallest share of the shifted rows whose joint values are available, not held out (our choice)
 MIN_PAIRED = 0.5
-# first rows of a shift that are tried at once; then those between (our choice)
+# number of first rows of a shift that are tried at once, before the rows between the best ones (our choice)
 MAX_CUTS = 120
-# rows in which two targets are looked for (our choice)
+# smallest number of rows in which two targets are searched (our choice)
 MIN_MIXED = 24
-# of sorting rows by target; a few are needed
+# largest number of iterations of the assignment of rows to targets; a few are needed
 MAX_ROUNDS = 50
 Blocks = Sequence[PoseMeasurements]
 

@@ -25,23 +25,23 @@ from calib.geometry.weighing import GeometricFit
 from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
 
-# poses that models are judged by (our choice)
+# largest number of poses by which models are compared (our choice)
 JUDGED_POSES = 20_000
-# labels of residual parts that count in metres
+# labels of the residual parts whose errors are evaluated in metres
 METRES = ("position", "consistency", "distance", "plane", "pixel")
 HARMONIC = ("cos", "sin")
-# first guess of a coefficient's magnitude, of harmonics that of the first order (our choice)
+# first guess of a coefficient's magnitude; for harmonics, that of the first order (our choice)
 FIRST_SIZE = 1e-4
-# rounds of the search for the ridges of a fold, and of all rows
+# largest number of iterations of the search for the ridges, of a fold and of all rows
 FOLD_ROUNDS = 8
 TOTAL_ROUNDS = 15
-# prior of a parameter without one [m, rad] (our choice)
+# prior standard deviation of a parameter without prior [m, rad] (our choice)
 UNKNOWN_SIGMA = 10.0
-# how far a frame may be from where it is [m, rad] (our choice)
+# prior standard deviation of a placement about its estimate [m, rad] (our choice)
 FRAME_SIGMA = 1.0
-# error by covariance alone over the nominal residuals: beyond, a fold says nothing (our choice)
+# largest ratio of the error by covariance to the nominal residuals, for a fold that can be predicted (our choice)
 MAX_BLIND_ERROR = 3.0
-# poses observed at once
+# number of poses evaluated at once
 CHUNK = 1000
 
 

@@ -13,12 +13,12 @@ import numpy as np
 from calib.data.poses.measurements import Distances, PoseMeasurements, Sockets, take
 from calib.errors import UsageError, require
 
-# regions of the joint space, and folds that they are divided among (our choice)
+# number of regions of the joint space, and number of folds over which they are distributed (our choice)
 REGIONS = 20
 FOLDS = 5
-# parts of a fold that the other rows do not determine
+# number of random parts of a fold that the other rows do not determine
 SCATTERED_FOLDS = 3
-# poses of which each may be held out alone
+# largest number of poses for folds of one pose each
 MAX_SINGLE_POSES = 150
 NAMES = ("transfer", "regions", "random", "poses")
 

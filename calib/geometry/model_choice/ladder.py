@@ -33,14 +33,14 @@ from calib.geometry.weighing import GeometricFit, Settings
 from calib.robot.calibrated import Deflection, Term
 from calib.robot.chain import Chain
 
-# an effect has to lower the error on held-out rows by this share (our choice)
+# smallest relative reduction of the error on held-out rows by an effect that is added (our choice)
 MIN_GAIN = 0.03
-# robust sigmas beyond which a row is not of this robot (our choice)
+# number of robust sigmas above which a row is a gross outlier (our choice)
 MAX_RESIDUAL = 8.0
-# highest orders of harmonics: of a joint's encoder and gear, and of its axis' wobble
+# highest orders of harmonics: for a joint's encoder and gear, and for the wobble of its axis
 MAX_ORDER = 60
 MAX_WOBBLE_ORDER = 2
-# harmonics of order k are offered to sets of at least this many poses times k (our choice)
+# harmonics of order k need at least this number of poses times k (our choice)
 POSES_PER_ORDER = 8
 RIGID_MODELS = ("frames", "offsets", "geometry")
 NONE = np.array([], dtype=int)
@@ -121,7 +121,7 @@ def _turning(chain: Chain, name: str, joint: int, max_order: int) -> list[Term]:
 
 MODELS = CHOICES[1:]
 FAMILIES = (_stiffness, _bending, _coupling, _harmonics, _wobble)
-# by name: from a chain, and whether gravity torques are known, to terms
+# effects by name: functions that return the terms for a chain, and for known or unknown gravity torques
 EFFECTS: dict[str, Callable[[Chain, bool], list[Term]]] = dict(zip(MODELS[3:], FAMILIES, strict=True))
 
 
