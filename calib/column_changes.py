@@ -145,7 +145,10 @@ def best_changes(
 
 
 class _Trial(NamedTuple):
-    """A change of columns that was tried: share of the rms residual that remains, and mean squared residuals (k,)."""
+    """A change of columns that was tried.
+
+    The fields are the share of the rms residual that remains, the change, and mean squared residuals (k,).
+    """
 
     share: float
     change: Change

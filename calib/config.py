@@ -273,7 +273,7 @@ def _entries(docstring: str) -> dict[str, str]:
 def check_keys(
     table: Mapping[str, object], keys: Collection[str], where: str, error: type[CalibError] = UsageError
 ) -> None:
-    """Raise an error for a key that is not in `keys`; its message suggests the most similar key."""
+    """Raise an error for a key of `table` that is not in `keys`; the message suggests the most similar key."""
     for key in table:
         if key not in keys:
             raise error(f"{where}: {_no_key(key, keys)}")

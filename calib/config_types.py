@@ -305,8 +305,9 @@ class OneOf(_Read):
 
 @dataclass(frozen=True)
 class Expect:
-    """Description of the expected value for error messages; numbers, texts and flags of another type are not
-    converted.
+    """Description of the expected value for error messages.
+
+    Numbers, texts and flags of another type are not converted.
     """
 
     words: str
@@ -408,9 +409,7 @@ class Hidden:
 
 @dataclass(frozen=True)
 class Typed:
-    """Form of a setting on the command line: the option's name, and the unit of its number (in Python the unit is
-    SI).
-    """
+    """Form of a setting on the command line: the option's name, and the unit of its number (SI in Python)."""
 
     name: str = ""
     unit: str = ""
@@ -418,9 +417,7 @@ class Typed:
 
 @dataclass(frozen=True)
 class OneOrMany(_Read):
-    """A number, converted to float, or a list of numbers, converted to a tuple; the reader treats the two
-    differently.
-    """
+    """A number, converted to float, or a list of numbers, converted to a tuple; the two have different meanings."""
 
     of: Real
 

@@ -177,12 +177,12 @@ def refuse_robot(where: object, message: str) -> NoReturn:
 
 
 def refuse_data(file: str | Path, message: str, column: str | None = None, row: int | None = None) -> NoReturn:
-    """Raise `MeasurementError` for a file or block of measured data, with its column or row (from 1)."""
+    """Raise `MeasurementError` for a file or block of measured data, with its column and row (from 1) if given."""
     raise MeasurementError(message, file, row, column)
 
 
 def refuse_option(where: object, message: str) -> NoReturn:
-    """Raise `UsageError` for an option, a command or an options file; `where` names it."""
+    """Raise `UsageError` for an option, a command or an options file, named by `where`."""
     raise UsageError(f"{where}: {message}")
 
 
@@ -261,8 +261,9 @@ def counted(number: int, noun: str, plural: str = "") -> str:
 
 @contextmanager
 def as_ours() -> Iterator[None]:
-    """Convert errors of ``poses`` and ``trajectories`` in the block to errors of this module, with the original as
-    cause.
+    """Convert errors of ``poses`` and ``trajectories`` in the block to errors of this toolkit.
+
+    The original error is kept as the cause.
     """
     try:
         yield

@@ -348,7 +348,7 @@ def check_regular(path: str | Path, streams: bool = False) -> None:
 
 
 def fingerprint(path: Path) -> str:
-    """Return the SHA-256 of a file in hex; the file is read again only if it changed."""
+    """Return the SHA-256 of a file in hex. The file is read again only if it changed since the last call."""
     status = path.stat()
     return _digest(path.absolute(), status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
 
@@ -383,7 +383,10 @@ def write_json(path: str | Path, value: object) -> Path:
 
 
 def _not_finite(value: object, path: str) -> Iterator[str]:
-    """Yield the paths of numbers that are not finite, as ``fit.nominal.position_mm.rms``."""
+    """Yield the names of numbers that are not finite, such as ``fit.nominal.position_mm.rms``.
+
+    `path` is the name of `value`.
+    """
     if isinstance(value, Mapping):
         for key, item in value.items():
             yield from _not_finite(item, f"{path}.{key}" if path else str(key))
@@ -448,7 +451,7 @@ def write_numbers(
 
 
 def remarks(notes: Sequence[str]) -> str:
-    """Return lines as comments of a CSV, TOML or YAML file."""
+    """Return the lines `notes` as comments of a CSV, TOML or YAML file."""
     return "".join(f"# {note}\n" for note in notes)
 
 

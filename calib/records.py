@@ -49,9 +49,7 @@ def shielded(text: str) -> str:
 
 
 def field_values(record: DataclassInstance) -> FieldValues:
-    """Return the values of a dataclass's fields by name, unconverted, to create a record of a class with further
-    fields.
-    """
+    """Return the values of a dataclass's fields by name, to create a record of a class with further fields."""
     return {field.name: getattr(record, field.name) for field in fields(record) if field.init}
 
 
@@ -185,9 +183,7 @@ def plain(value: object, null: bool = False) -> Any:
 
 @cache
 def _keys(kind: type) -> dict[str, bool]:
-    """Return, for each field and stored property of a record type, whether a number that is not finite is written as
-    null.
-    """
+    """Return, for each field and stored property of a record type, whether non-finite numbers are written as null."""
     hints = get_type_hints(kind, include_extras=True)
     keys = {field.name: _nullable(hints[field.name]) for field in fields(kind)}
     for base in kind.__mro__:
@@ -239,9 +235,7 @@ def _adapter(kind: type[T]) -> TypeAdapter[T]:
 
 
 def evenly(count: int, max_rows: int) -> np.ndarray:
-    """Return row numbers (m,) out of `count` rows, spread evenly from the first to the last: all, or `max_rows` of
-    them.
-    """
+    """Return row numbers (m,) out of `count` rows, spread evenly from first to last: all, or `max_rows` of them."""
     return np.unique(np.linspace(0, count - 1, min(count, max_rows)).astype(int))
 
 
@@ -264,9 +258,7 @@ def as_subclass(record: Any, kind: type[T]) -> T:
 
 
 class Frozen:
-    """Base class of dataclasses whose fields annotated ``np.ndarray`` are stored as read-only copies (floats or
-    booleans).
-    """
+    """Base class of dataclasses whose ``np.ndarray`` fields are stored as read-only copies (floats or booleans)."""
 
     def __post_init__(self) -> None:
         for field in fields(self):  # type: ignore[arg-type]

@@ -37,11 +37,10 @@ def from_xyz_rpy(xyz: ArrayLike, rpy: ArrayLike) -> np.ndarray:
 
 
 def to_xyz_rpy(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return xyz [m] and roll-pitch-yaw [rad] of one pose (4, 4); `from_xyz_rpy` reproduces the pose also near pitch
-    ±90°.
+    """Return xyz [m] and roll-pitch-yaw [rad] of one pose (4, 4).
 
-    Near pitch ±90°, yaw is not determined. Roll is therefore taken from Rz(-yaw) R instead of from R, so that it
-    compensates any value of yaw.
+    `from_xyz_rpy` reproduces the pose, also near pitch ±90°, where yaw is not determined: roll is taken from Rz(-yaw) R
+    instead of from R, so that it compensates any value of yaw.
     """
     rotation = poses[:3, :3]
     yaw = np.arctan2(rotation[1, 0], rotation[0, 0])

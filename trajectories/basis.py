@@ -40,8 +40,9 @@ class SampledMotion:
         return len(self.times)
 
     def evaluated(self, regressor: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
-        """Return regressor(q, v, a) of the samples, stored at the first call for objectives and torque limits to
-        share.
+        """Return regressor(q, v, a) of the samples.
+
+        It is stored at the first call, so that objectives and torque limits share it.
         """
         if regressor not in self._evaluated:
             self._evaluated[regressor] = regressor(self.q, self.v, self.a)
@@ -103,7 +104,7 @@ class Basis:
         return variables[self.used]
 
     def adjoint(self, slopes: np.ndarray) -> np.ndarray:
-        """Return the gradients (m, p) by the variables of m functions, from their gradients (m, 4, N, n) by q, v, a,
+        """Return the gradients (m, p) of m functions by the variables, from their gradients (m, 4, N, n) by q, v, a,
         jerk.
         """
         m, _, count, n = slopes.shape
@@ -115,7 +116,10 @@ class Basis:
 
 
 class Family(Protocol):
-    """Interface of a family of periodic motions for the optimiser; `Fourier` and `BSpline` implement it."""
+    """Interface of a family of periodic motions for the optimiser.
+
+    `calib.trajectories.fourier.Fourier` and `calib.trajectories.bspline.BSpline` implement it.
+    """
 
     @property
     def period(self) -> float: ...

@@ -1,6 +1,8 @@
-"""Periodic B-splines, with the interface of `calib.trajectories.fourier`.
+"""Periodic B-splines, with the same interface as the Fourier series of `calib.trajectories.fourier`.
 
-q_j(t) = Σ_{i=1}^{C} c_ji B_i(t),    uniform knots over one period, B_i periodic of a stated degree (5: smooth jerk)
+    q_j(t) = Σ_{i=1}^{C} c_ji B_i(t)
+
+The knots are uniform over one period, and the basis functions B_i are periodic and of a given degree (5: smooth jerk).
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,7 +36,7 @@ class BSpline:
         return len(self.counts)
 
     def basis(self, times: np.ndarray) -> Basis:
-        """Return the family's basis at times (N,) [s]."""
+        """Return the linear map from variables to motion at times (N,) [s]."""
         tables = [_table(times, self.period, count, self.degree) for count in self.counts]
         return assemble(times, tables, self.freedoms)
 
@@ -47,7 +49,7 @@ class BSpline:
         return projected(self.freedoms, coefficients)
 
     def evaluate(self, x: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
-        """Return d^r q / dt^r (N, n) from the control points by de Boor's recursion, without the tables."""
+        """Return d^r q / dt^r (N, n) from the control points by de Boor's recursion, without the coefficient tables."""
         result = np.zeros((len(times), self.n))
         for j, (count, points) in enumerate(zip(self.counts, self.coefficients(x))):
             if count == 1:
@@ -77,8 +79,9 @@ class BSpline:
         return np.array(bounds)
 
     def random(self, rng: np.random.Generator, centre: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
-        """Return the variables (p,) of a random motion about `centre` (n,); `amplitude` (n,) spreads its control
-        points.
+        """Return the variables (p,) of a random motion about `centre` (n,).
+
+        The control points are spread by `amplitude` (n,).
         """
         points = []
         for count, middle, size in zip(self.counts, centre, amplitude):

@@ -34,7 +34,7 @@ class Fourier:
         return len(self.harmonics)
 
     def basis(self, times: np.ndarray) -> Basis:
-        """Return the family's basis at times (N,) [s]."""
+        """Return the linear map from variables to motion at times (N,) [s]."""
         tables = [_table(times, self.period, count) for count in self.harmonics]
         return assemble(times, tables, self.freedoms)
 

@@ -111,9 +111,7 @@ def average(values: np.ndarray, mean: Recalled) -> Averaged:
 
 
 def _likeness(q: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Return the likeness 1 - D(k) / Σ |r - mean|² (N - P + 1,) of recording q and reference r at every start sample
-    k.
-    """
+    """Return 1 - D(k) / Σ |r - mean|² (N - P + 1,) of recording q and reference r for every start sample k."""
     centre = r.mean(axis=0)
     q = q - centre
     r = r - centre

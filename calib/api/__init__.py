@@ -1,3 +1,1 @@
-"""Implementation of the Python API: functions for the stages of a calibration, and result classes with console
-output.
-"""
+"""Implementation of the Python API: functions for the stages of a calibration, and classes of results."""

@@ -68,9 +68,7 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
 
     @property
     def estimate(self) -> Estimate:
-        """The base parameters with their covariance, which includes the contribution of the geometry's covariance if
-        known.
-        """
+        """The base parameters with their covariance, which includes that of the geometry if known."""
         estimate = self.found.fitted.estimate
         if self.carried is None:
             return estimate
@@ -91,7 +89,7 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
 
     @one_blas_thread()
     def torque_sigma(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the standard deviations (N, rows) [N m or N] of predicted torques; ± 1.96 σ contains 95 %.
+        """Return the standard deviations σ (N, rows) [N m or N] of predicted torques; ± 1.96 σ contains 95 %.
 
         They include the part of recorded torques, within the band of the filter, that the model does not explain.
 

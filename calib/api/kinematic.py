@@ -102,9 +102,7 @@ class PoseSelection(ChartedResult, WithoutVerdict, selection.Chosen):
         return result
 
     def to_dict(self) -> dict[str, object]:
-        """Return the results of the selection: index, its value, the value of random poses, efficiency, seconds,
-        notes.
-        """
+        """Return the results of the selection: index, its value, value of random poses, efficiency, seconds, notes."""
         return selection.record(self)
 
     def to_dataframe(self) -> DataFrame:
@@ -192,9 +190,7 @@ class GeometryFit(ChartedResult, ReportedResult, fit.Outcome):
         return self.expected.position_sigma(self._poses(q), tool=tool)
 
     def _poses(self, q: object) -> PoseMeasurements:
-        """Return poses at joint values q (m, n), with gravity torques (m, n) [N m] if the masses of the links are
-        known.
-        """
+        """Return poses at joint values q (m, n), with gravity torques (m, n) [N m] if the links' masses are known."""
         chain = self.inputs.chain
         q = shaped(np.atleast_2d(np.asarray(q, dtype=float)), (None, chain.n), "q")
         return PoseMeasurements(q, chain.joint_names, torque=gravity_of(self.inputs.weighed, q))

@@ -44,11 +44,10 @@ class ExcitationDesign(ChartedResult, WithoutVerdict, design.Designed):
     tab = "period condition goals proof outlook predicted front notes sampled plot save to_dict"
 
     def sampled(self, rate: float | None = None) -> Sampled:
-        """Return t (N,) [s] and q, v, a (N, n) [rad or m, per s, per s²] of one period at `rate` [Hz], both ends
-        included.
+        """Return t (N,) [s] and q, v, a (N, n) [rad or m, per s, per s²] of one period, both ends included.
 
-        Without `rate`, the samples are those that `save` writes, at the controller's rate. Samples at any rate are
-        computed from the series of the motion, not interpolated.
+        The samples are at `rate` [Hz]; without it they are those that `save` writes, at the controller's rate. Samples
+        at any rate are computed from the series of the motion, not interpolated.
         """
         return _columns(folder.one_period(self, rate))
 

@@ -78,9 +78,7 @@ class Errors:
 
     @property
     def main(self) -> np.ndarray:
-        """Errors that decide the verdict: of positions or, without positions, of distances [m]; empty without
-        either.
-        """
+        """Errors that decide the verdict: of positions or, without positions, of distances [m]; empty without both."""
         if self.position is not None:
             return self.position
         if self.distance is not None:
@@ -131,9 +129,7 @@ def _concatenated(sizes: list[np.ndarray]) -> np.ndarray | None:
 
 
 def statistics(sizes: np.ndarray | None, factor: float = 1.0) -> ErrorStatistics | None:
-    """Return mean, rms, 95 % quantile and maximum of `factor` times the error magnitudes; None where `sizes` is
-    None.
-    """
+    """Return mean, rms, 95 % quantile and maximum of `factor` times the error magnitudes; None for None."""
     if sizes is None:
         return None
     scaled = factor * sizes

@@ -156,7 +156,7 @@ class ErrorModel:
     def _sigma_and_radius(
         self, parameter_variance: np.ndarray, q: np.ndarray, radii: tuple[float, float]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the standard deviation (m,) [m] of each error, and the number of them (m,) that contains 95 % of the
+        """Return the standard deviation (m,) [m] of each error, and the multiple of it (m,) that contains 95 % of
         errors.
 
         Args:
@@ -173,9 +173,7 @@ class ErrorModel:
         return sigma, np.interp(from_poses + from_ranges, model.reach, radii)
 
     def _widening(self, q: np.ndarray) -> np.ndarray:
-        """Return the factors (m,) by which the 95 % intervals widen where joints are outside their fitted ranges; 1
-        inside.
-        """
+        """Return the factors (m,) by which the 95 % intervals widen outside the fitted joint ranges; 1 inside."""
         result = np.ones(len(q))
         for joint, (below, above) in enumerate(self.discrepancy.wider):
             levels = [0.0, END_SHARE, 1.0 - END_SHARE, 1.0]
@@ -189,9 +187,7 @@ class ErrorModel:
 
 
 def outside(q: np.ndarray, learnt: np.ndarray) -> np.ndarray:
-    """Return a mask (m, n) of the joint values q (m, n) that are outside the range of the fitted poses `learnt` (k,
-    n).
-    """
+    """Return a mask (m, n) of the joint values q (m, n) that are outside the range of the poses `learnt` (k, n)."""
     return np.asarray((q < learnt.min(axis=0)) | (q > learnt.max(axis=0)))
 
 
@@ -308,8 +304,9 @@ def learn_errors(selection: ModelSelection, measured: Sequence[PoseMeasurements]
 
 
 def _range_folds(measured: Sequence[PoseMeasurements]) -> list[tuple[int, Folds]]:
-    """Return, for each joint that moves, its index and two folds, which hold out the lower and upper end of its
-    range.
+    """Return, for each joint that moves, its index and two folds.
+
+    The folds hold out the lower and the upper end of the joint's range.
     """
     q = np.concatenate([block.q for block in measured])
     edges = np.cumsum([len(block) for block in measured])[:-1]

@@ -153,8 +153,9 @@ def place_pose(arm: np.ndarray, measured: np.ndarray) -> Placements:
 
 
 def by_orientations(arm: np.ndarray, measured: np.ndarray) -> Placements:
-    """Return S and X by Shah's method, which is accurate if the poses rotate about two axes by much more than their
-    errors.
+    """Return S and X by Shah's method from the orientations of the poses.
+
+    The result is accurate if the poses rotate about two axes by much more than the errors of the orientations.
     """
     # vec(R_S R_A R_X) = vec(R_B): the sum of R_B ⊗ R_A has vec(R_S) and vec(R_X) as its first singular pair
     kernel = np.einsum("mij,mkl->ikjl", measured[:, :3, :3], arm[:, :3, :3]).reshape(9, 9)
@@ -168,7 +169,7 @@ def by_orientations(arm: np.ndarray, measured: np.ndarray) -> Placements:
 
 
 def _by_displacements(arm: np.ndarray, measured: np.ndarray) -> Placements:
-    """Return S and X (4, 4) from rotations and displacements about the mean; accurate even for nearly equal
+    """Return S and X (4, 4) from rotations and displacements about the mean; also accurate for nearly equal
     orientations.
 
     log(R_B,i R̄_Bᵀ) = R_S log(R_A,i R̄_Aᵀ), where R̄ is the chordal mean of the rotations, and y_i - ȳ = R_S (a_i - ā +
@@ -322,8 +323,8 @@ def check_scale(block: PoseMeasurements, chain: Chain) -> None:
         chain: the nominal arm, which predicts the positions.
 
     Raises:
-        MeasurementError: the ratio of the two spreads is beyond `max_ratio` (the message names the units that would
-            explain it), or the positions lie on a line.
+        MeasurementError: the ratio of the two spreads, or its inverse, is above `MAX_RATIO` (the message names the
+            units that would explain it), or the positions lie on a line.
     """
     if not isinstance(block, Positions) or len(block) < 3:
         return
@@ -358,9 +359,7 @@ def _spread(positions: np.ndarray) -> tuple[float, float]:
 
 
 def _likely_units(block: Positions, chain: Chain, measured: float, predicted: float) -> tuple[str, str]:
-    """Return a question about the units that would explain the spread, and the column header that states these
-    units.
-    """
+    """Return a question about the units that would explain the spread, and a column header that states these units."""
     # what to ask about the joints, the spread that follows, and the header that states the unit
     guesses = [("", predicted, "'x [mm]'")]
     if np.abs(block.q).max() < MAX_TURN:
@@ -469,8 +468,9 @@ def _median_offset(rotation: np.ndarray, lever: np.ndarray) -> np.ndarray:
 
 
 def _linear_offset(rotation: np.ndarray, position: np.ndarray, measured: np.ndarray) -> np.ndarray:
-    """Return the offset t (3,) [m] that solves R_Sᵀ y - c - R t = a, linear in the nine numbers of R_Sᵀ, in c and in
-    t.
+    """Return the offset t (3,) [m] that solves R_Sᵀ y - c - R t = a by linear least squares.
+
+    The unknowns are the nine numbers of R_Sᵀ, c and t.
     """
     m = len(measured)
     centre = measured.mean(axis=0)

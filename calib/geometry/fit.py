@@ -121,7 +121,7 @@ def fit(
 
 
 def _require_enough(cell: Installation, blocks: list[Block], unknowns: int) -> None:
-    """Raise MeasurementError for fewer than `MIN_NUMBERS` measured numbers per unknown: such a fit could not be
+    """Raise MeasurementError for fewer than `MIN_NUMBERS` measured numbers per unknown, since a fit could not be
     checked.
     """
     numbers = 0
@@ -160,8 +160,7 @@ def plain_fit(cell: Installation, measured: Sequence[PoseMeasurements]) -> Geome
 
 
 def _estimated(cell: Installation, split: ColumnSplit, candidates: np.ndarray) -> np.ndarray:
-    """Return the parameters to estimate: those of the arm that have an effect, and the base parameters of all other
-    kinds.
+    """Return the parameters to estimate: arm parameters that have an effect, and base parameters of all other kinds.
 
     Arm parameters that only displace base or tool are excluded: the placements of base and tool represent the same
     effect.
@@ -205,7 +204,7 @@ def _scale_reference(cell: Installation, split: ColumnSplit, candidates: np.ndar
 
 
 def _depend_by_scale(lengths: np.ndarray, split: ColumnSplit) -> np.ndarray:
-    """Return a mask (p - b,) of the dropped columns that depend on the kept columns as under a common factor on all
+    """Return a mask (p - b,) of the dropped columns that depend on the kept ones as under a scale common to all
     lengths.
 
     Args:
@@ -309,8 +308,9 @@ def _most_probable_widths(
 
 
 def _making_families(cell: Installation, free: np.ndarray, has_stated_prior: np.ndarray) -> np.ndarray:
-    """Return each parameter's family (f,): joint offsets, other angles or lengths; -1 for a parameter without width
-    of making.
+    """Return each parameter's family (f,): joint offsets, other angles or lengths.
+
+    -1 is for a parameter without width of making.
     """
     kinds = np.where(has_stated_prior, "", families(cell)[free])
     family = np.full(len(free), -1)

@@ -97,7 +97,9 @@ class Installation:
         return self.chain.stretched_length() + float(tool_lengths.max(initial=0.0))
 
     def merged(self) -> Installation:
-        """Return the installation with known and fitted deflections in one."""
+        """Return the installation with the known deflections of an earlier fit and the fitted ones in one field,
+        `deflection`.
+        """
         if not self.known.terms:
             return self
         terms = (*self.known.terms, *self.deflection.terms)
@@ -249,8 +251,9 @@ def _placed(
 
 
 def _placements(entries: tuple[Mapping[str, object], ...], source: str) -> tuple[tuple[str, ...], np.ndarray]:
-    """Return the names and placements (k, 4, 4) of the k entries of a table; an entry without name is named by its
-    number.
+    """Return the names and placements (k, 4, 4) of the k entries of a table.
+
+    An entry without name is named by its number.
     """
     names = []
     placements = []

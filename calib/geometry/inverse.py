@@ -100,7 +100,7 @@ def _differences(seen: Seen, targets: np.ndarray, dof: int) -> np.ndarray:
 
 
 def differences_jacobian(goal: Goal, seen: Seen) -> np.ndarray:
-    """Return the Jacobian (m, dof, n) of the pose components of `differences` with respect to the joints."""
+    """Return the Jacobian (m, dof, n) of the tool's pose components, as in `differences`, by the joint values."""
     jacobian = joint_jacobian(goal.cell.chain, seen.walked, seen.point)
     if goal.dof == 3:
         return jacobian[:, :3]
@@ -167,8 +167,9 @@ def _weighted(goal: Goal, q: np.ndarray, targets: np.ndarray) -> tuple[np.ndarra
 def _step_within_limits(
     goal: Goal, q: np.ndarray, error: np.ndarray, jacobian: np.ndarray, damping: np.ndarray
 ) -> np.ndarray:
-    """Return damped joint steps (m, n); a joint that would exceed its limit stops at it, and the other joints
-    compensate.
+    """Return damped joint steps (m, n) within the joint limits.
+
+    A joint that would exceed its limit stops at it, and the other joints compensate.
     """
     step = _damped(jacobian, error, damping)
     for _ in range(q.shape[1]):
@@ -193,8 +194,7 @@ def _damped(jacobian: np.ndarray, error: np.ndarray, damping: np.ndarray) -> np.
 
 
 def nearest(goal: Goal, targets: np.ndarray, start: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return, for a redundant arm, the joint values (m, n) nearest to `start` among those with the same tool poses as
-    `q`.
+    """Return the joint values (m, n) nearest to `start` that have the same tool poses as `q`, for a redundant arm.
 
     The function minimises |q - q_start| (radians and metres with equal weight) under e(q) = 0. Each pass steps by d +
     J⁺ (e - J d) with d = q_start - q. The given `q` is kept for targets that the result would no longer reach.

@@ -66,7 +66,10 @@ Profile = tuple[tuple[tuple[float, ...], tuple[float, ...]], ...]
 
 
 def unevenness(profile: Profile, q: np.ndarray) -> np.ndarray:
-    """Return the factor s (m,) of the error variance at poses q (m, n) [rad or m]; 1 for an empty profile."""
+    """Return the factor s (m,) by which the error variance at poses q (m, n) is larger than on average.
+
+    1 for an empty profile. q is in rad or m.
+    """
     log_factor = np.zeros(len(q))
     for joint, (knots, values) in enumerate(profile):
         log_factor = log_factor + np.interp(q[:, joint], knots, values)
@@ -107,7 +110,7 @@ class Unevenness:
         self.data = gram(self.logs, self.columns)
 
     def profile(self, left_out: np.ndarray | None = None) -> Profile:
-        """Return log s as one function per joint, estimated from all poses, or without those of the mask `left_out`
+        """Return log s as one function per joint, estimated from all poses or without those in the mask `left_out`
         (m,).
         """
         data = self.data
@@ -219,8 +222,7 @@ class LeftOut:
         return replace(self, shapes=shapes), estimate.profile()
 
     def learnt(self, start: Sequence[float] = ()) -> tuple[list[float], tuple[float, float]]:
-        """Return κ, v_0, v_1, v_2, estimated from |e|² ~ variance · χ²_3 / 3, and the 95 % radii of near and far
-        errors.
+        """Return κ, v_0, v_1, v_2, estimated from |e|² ~ variance · χ²_3 / 3, and the near and far 95 % radii.
 
         Args:
             start: values from which the search starts; empty for values from the errors' median.

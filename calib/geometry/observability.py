@@ -151,8 +151,9 @@ def _confused(fit: GeometricFit, position: list[int], index: dict[str, int]) -> 
 
 
 def _orientation_range(fit: GeometricFit) -> float | None:
-    """Return the range that contains 95 % of the flange's orientations [deg]; None where no poses were measured by
-    an instrument.
+    """Return the range that contains 95 % of the flange's orientations [deg].
+
+    None where no poses were measured by an instrument.
     """
     q = [block.measured.q for block in fit.blocks if block.measured.has_instrument]
     if not q:
@@ -262,9 +263,7 @@ class Observation:
         return point, self(q)[:, :3] * self.sigmas[0]
 
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-        """Return Σ G[i] · ∂J[i]/∂q (m, n) for weights G (m, rows, p) of the whitened Jacobian J, computed
-        analytically.
-        """
+        """Return Σ G[i] · ∂J[i]/∂q (m, n) for weights G (m, rows, p) of the whitened Jacobian J, in closed form."""
         chain = self.cell.chain
         count = len(chain.elements)
         # element of each parameter; -1 for the station, behind the last element for tools
@@ -301,9 +300,7 @@ class TargetPose:
 
 @dataclass(frozen=True, eq=False)
 class TargetJacobian:
-    """Jacobian of a target in the arm's base: q (m, n) -> (m, 6, n), velocity then angular velocity per joint
-    velocity.
-    """
+    """Jacobian of a target in the arm's base: q (m, n) -> (m, 6, n), [v; ω] per joint velocity."""
 
     cell: Installation
     number: int = 0
@@ -314,8 +311,8 @@ class TargetJacobian:
 
 
 def targets_of(chain: Chain, tools: Sequence[Sequence[float]] = ()) -> Installation:
-    """Return the arm with targets at positions (3,) [m] in the tip's frame; with one target at the tip if `tools` is
-    empty.
+    """Return the arm with targets at the positions `tools` (3,) [m] in the tip's frame; empty for one target at the
+    tip.
     """
     positions = [np.asarray(tool, dtype=float) for tool in tools] or [np.zeros(3)]
     names = ("tool",)

@@ -52,8 +52,8 @@ class ParameterLayout:
 
     @property
     def frame_index(self) -> np.ndarray:
-        """Indices of station and tool placements, and of fitted camera and board parameters: all but the robot's
-        parameters.
+        """Indices of station and tool placements, and of fitted camera and board parameters: all but those of the
+        robot.
         """
         return np.concatenate([self.index("station", "tool"), np.array(self.moving, dtype=int)])
 
@@ -75,7 +75,7 @@ class ParameterLayout:
 
 
 def layout(cell: Installation) -> ParameterLayout:
-    """Return the layout of an installation's parameters."""
+    """Return names, units and kinds of all parameters of an installation."""
     chain = cell.chain
     frame_names, frame_units = [], []
     for frame in (*cell.station_names, *cell.tool_names):
@@ -129,9 +129,7 @@ def step(cell: Installation, free: np.ndarray, change: np.ndarray) -> Installati
 
 
 def _displaced(placements: np.ndarray, displacements: np.ndarray) -> np.ndarray:
-    """Return placements (k, 4, 4), each displaced by six numbers out of (k, 6): along its axes [m] and about them
-    [rad].
-    """
+    """Return placements (k, 4, 4) displaced by `displacements` (k, 6): along [m] and about [rad] their axes."""
     result = np.array(placements)
     for number, displacement in enumerate(displacements):
         if displacement.any():
@@ -140,7 +138,7 @@ def _displaced(placements: np.ndarray, displacements: np.ndarray) -> np.ndarray:
 
 
 def layout_counts(cell: Installation) -> tuple[int, int, int, int, int]:
-    """Return the number of parameters of each of `KINDS`."""
+    """Return the number of parameters of each kind, in the order of `KINDS`."""
     stations = 6 * len(cell.stations)
     tools = 6 * len(cell.tools)
     return len(cell.chain.elements), stations, tools, len(cell.optics), len(cell.deflection.terms)
@@ -204,8 +202,9 @@ class Block:
 
 
 def prepare(cell: Installation, measured: Sequence[PoseMeasurements]) -> list[Block]:
-    """Return the blocks with the indices of their stations and tools (found by name) and their deflection's basis
-    functions.
+    """Return the blocks with the indices of their stations and tools, and the basis functions of their deflections.
+
+    Stations and tools are found by name.
 
     Raises:
         UsageError: the installation does not have a station or tool of that name.
@@ -369,8 +368,9 @@ def target_jacobian(
 
 
 def _station_column(column: np.ndarray, placement: np.ndarray, seen: Seen, axis: int) -> None:
-    """Fill `column` (6, m) with the targets' [v; ω] per unit displacement of a station along or about one of its
-    axes.
+    """Fill `column` (6, m) with the targets' [v; ω] per unit displacement of a station.
+
+    The displacement is along or about one of the station's axes, given by `axis`.
     """
     direction = placement[:3, axis % 3]
     if axis < 3:

@@ -44,9 +44,7 @@ MeanAndMax = Mapping[str, float]
 
 @dataclass(frozen=True)
 class RepeatedPose:
-    """One pose measured several times: its rows, AP of both arms along the axes of the arm's base, RP and vAP [mm,
-    deg].
-    """
+    """One pose measured several times: its rows, AP of both arms along the base's axes, RP and vAP [mm, deg]."""
 
     rows: tuple[int, ...]
     repeatability_mm: float
@@ -255,9 +253,7 @@ def _directions(measured: Positions, rows: np.ndarray) -> np.ndarray:
 
 
 def _variation(points: np.ndarray, directions: np.ndarray) -> float:
-    """Return vAP [m] of points (k, 3) approached from directions (k, 3); NaN where there are fewer than two
-    directions.
-    """
+    """Return vAP [m] of points (k, 3) approached from directions (k, 3); NaN for fewer than two directions."""
     remaining = np.flatnonzero(~np.isnan(directions[:, 0]))
     centres: list[np.ndarray] = []
     while len(remaining):
@@ -330,8 +326,9 @@ def _measured_again(fit: Sequence[PoseMeasurements], unseen: PoseMeasurements) -
 
 
 def _marks(block: PoseMeasurements) -> list[bytes]:
-    """Return a key for each row, equal for equal rows: its joint values and measured numbers, rounded to 12
-    decimals.
+    """Return a key for each row: its joint values and measured numbers, rounded to 12 decimals.
+
+    Equal rows have equal keys.
     """
     table = np.column_stack([block.q, block.tool.astype(float), block.measured])
     return [row.tobytes() for row in np.round(table, 12) + 0.0]

@@ -27,8 +27,9 @@ MIN_CHANGE = 1e-13
 
 
 class CommonNoise(Protocol):
-    """Errors that several rows share, such as those of all corners of an image; `ImageNoise` in
-    `calib.geometry.camera.pixel_residuals` implements it.
+    """Errors that several rows share, such as those of all corners of an image.
+
+    `calib.geometry.camera.pixel_residuals.ImageNoise` implements this interface.
     """
 
     @property
@@ -91,8 +92,9 @@ class ResidualPart:
 
     @property
     def per_length(self) -> np.ndarray | float:
-        """Numbers by which residuals are divided to convert them to metres: 1, or pixels per metre for residuals in
-        pixels.
+        """Numbers by which residuals are divided to convert them to metres.
+
+        1 for residuals in metres; for pixels, the pixels per metre.
         """
         return 1.0
 
@@ -179,9 +181,7 @@ def _pose(measured: Poses, seen: Seen, jacobian: np.ndarray) -> list[ResidualPar
 
 @parts.register
 def _position(measured: Positions, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
-    """Return the residuals of positions, r = y - p (measured minus predicted), without the errors that all rows
-    share.
-    """
+    """Return the residuals of positions, r = y - p (measured minus predicted), without errors that all rows share."""
     value = measured.position.T - seen.point
     linear = jacobian[:, :3]
     shared = 0
@@ -227,9 +227,7 @@ def _pairs(measured: Distances) -> tuple[np.ndarray, np.ndarray]:
 
 @parts.register
 def _sockets(measured: Sockets, seen: Seen, jacobian: np.ndarray) -> list[ResidualPart]:
-    """Return the residuals of sockets: mean of the group minus p, and L - |mean_a - mean_b| for known socket
-    distances L.
-    """
+    """Return the residuals of sockets: group mean minus p, and L - |mean_a - mean_b| for known socket distances L."""
     groups, group_of_row, counts = np.unique(measured.group, return_inverse=True, return_counts=True)
     rows = np.arange(len(measured))
     average = np.zeros((len(measured), len(groups)))
@@ -314,7 +312,7 @@ def _sphere_centre(points: np.ndarray, lengths: np.ndarray) -> np.ndarray:
 
 
 def _project(rows: np.ndarray, nuisance: np.ndarray) -> np.ndarray:
-    """Return `rows` (f, m) with the nuisance columns (m, k) projected out."""
+    """Return the part of `rows` (f, m) that is orthogonal to the nuisance columns (m, k)."""
     q, _ = np.linalg.qr(nuisance)
     return rows - (rows @ q) @ q.T
 

@@ -92,8 +92,8 @@ class GeometricFit:
 
     @property
     def base(self) -> np.ndarray:
-        """Indices (b,) of the base parameters in the full vector; all fitted parameters where the caller chose
-        these.
+        """Indices (b,) of the base parameters in the full vector; all fitted ones where the caller chose the
+        parameters.
         """
         if self.split is None:
             return self.free
@@ -101,9 +101,7 @@ class GeometricFit:
 
     @property
     def identified(self) -> int:
-        """Number of identifiable parameters: base parameters of rigid geometry and placements, and joint
-        corrections.
-        """
+        """Number of identifiable parameters: base parameters of geometry and placements, and joint corrections."""
         if self.split is None:
             return len(self.free)
         corrections = np.setdiff1d(self.free, self.candidates)
@@ -374,8 +372,9 @@ class Weigher:
         return self.prior is None or abs(self.noise / self.noise_of_pass - 1.0) < MAX_CHANGE
 
     def unsettled_result(self, solution: Solution) -> GeometricFit:
-        """Return the fit of the last pass with the weights of that pass, although new sigmas would change the
-        estimate.
+        """Return the fit of the last pass with the weights of that pass.
+
+        It is used where new sigmas would still change the estimate after the last pass.
         """
         self.pieces = self.pieces_of_pass
         self.noise = self.noise_of_pass
@@ -388,9 +387,7 @@ class Weigher:
         return float(np.sum(np.diag(covariance(solution.factor)) * self._precision()))
 
     def _precision(self) -> np.ndarray:
-        """Return the prior's precisions (f,), multiplied by the square of `noise`; zero for parameters without a
-        prior.
-        """
+        """Return the prior's precisions (f,), multiplied by `noise` squared; zero for parameters without a prior."""
         if self.prior is None:
             return np.zeros(len(self.free))
         return (self.noise / self.prior) ** 2
@@ -423,9 +420,7 @@ class Weigher:
 
     @property
     def _many(self) -> bool:
-        """Whether W is large, and its rows are of a kind whose statistics WᵀW are computed faster than the rows
-        themselves.
-        """
+        """Whether W is large, and WᵀW is computed faster than its rows, which is so for positions and poses."""
         count = sum(piece.sigma.size for piece in self.pieces) * len(self.free)
         return count > MOST_NUMBERS and all(separable(block.measured) for block in self.blocks)
 
@@ -508,16 +503,12 @@ def _rows(cell: Installation, free: np.ndarray, blocks: list[Block], pieces: lis
 
 
 def _scales(pieces: list[Piece], number: int) -> list[np.ndarray]:
-    """Return the numbers (rows, m) by which a block's residual parts are divided: sigma over root of the robust
-    weight.
-    """
+    """Return the divisors (rows, m) of a block's residual parts: sigma over the root of the robust weight."""
     return [piece.sigma / np.sqrt(piece.weight) for piece in pieces if piece.block == number]
 
 
 def _sigma(part: ResidualPart, share: float, start: bool, robustly: bool) -> np.ndarray:
-    """Return the standard deviations (rows, m) of a part: those stated in the file, or one estimated from the
-    residuals.
-    """
+    """Return the standard deviations (rows, m) of a part: stated in the file, or estimated from the residuals."""
     if part.sigma is not None:
         return part.sigma
     if start:

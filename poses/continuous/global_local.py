@@ -93,9 +93,7 @@ def mlsl_search(
 
 
 def _charged(space: SearchSpace, q: np.ndarray, index: Index, existing: np.ndarray | None) -> tuple[float, np.ndarray]:
-    """Return the smoothed merit of poses q (m, n) minus the penalty for violated constraints, and its gradient (m,
-    n).
-    """
+    """Return the smoothed merit of poses q (m, n), less the penalty for violated constraints, and its gradient."""
     value, gradient = merit_of(space, q, index, existing, SHARPNESS[0])
     broken = np.maximum(constraint_values(space, q), 0.0)
     by_q = np.einsum("mk,mkn->mn", broken, constraint_gradients(space, q))

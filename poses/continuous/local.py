@@ -336,7 +336,7 @@ def restored(space: SearchSpace, q: np.ndarray, steps: int = 20) -> np.ndarray:
 
 
 def _keeps(space: SearchSpace, q: np.ndarray) -> np.ndarray:
-    """Return whether each pose satisfies the constraints, (m,) bool; the predicate is not checked."""
+    """Return whether each pose q (m, n) satisfies the constraints, (m,) bool; the predicate is not checked."""
     satisfied = constraint_values(space, q) <= FEASIBLE
     return np.asarray(satisfied.all(axis=1))
 

@@ -73,8 +73,9 @@ class Observed(NamedTuple):
     columns: np.ndarray | slice
 
     def by_regressor(self, by_information: np.ndarray) -> np.ndarray:
-        """Return the gradient ∂F/∂regressor (N, n, b) = 2 W S, divided by the sigmas, with S = ∂F/∂M (c, c)
-        symmetric.
+        """Return the gradient ∂F/∂regressor (N, n, b) = 2 W S, divided by the sigmas.
+
+        S = ∂F/∂M (c, c) is symmetric.
         """
         count, n, b = self.shape
         slope = np.zeros((b, n, count))
@@ -129,8 +130,9 @@ class Excitation:
         return self.seen(self.observed(regressor))
 
     def observed(self, regressor: np.ndarray) -> Observed:
-        """Return the observation matrix of this objective's columns and its information matrix, from a regressor (N,
-        n, b).
+        """Return the observation matrix and its information matrix, from a regressor (N, n, b).
+
+        They contain the columns that this objective uses.
         """
         columns = slice(None)
         if self.columns is not None:
@@ -146,14 +148,12 @@ class Excitation:
         return Observed(W, information(W, existing), regressor.shape, self.sigmas, columns)
 
     def seen(self, matrix: Observed) -> Value:
-        """Return the index of an observation matrix formed with this objective's columns, sigmas and existing
-        information.
-        """
+        """Return the index of an observation matrix that was formed for this objective by `observed`."""
         value, by_m, exact = self.of_information(matrix.M)
         return Value(value, exact=exact, by_information=by_m)
 
     def of_information(self, M: np.ndarray) -> tuple[float, np.ndarray, float]:
-        """Return the index F of an information matrix M (c, c), its symmetric gradient S = ∂F/∂M, and F unsmoothed.
+        """Return the index F of an information matrix M (c, c), its gradient S = ∂F/∂M, and F without smoothing.
 
         With C = D M D, D = diag(M)^-1/2 (normalised): ∂F/∂M = D S_C D - diag((C S_C)_kk / M_kk).
         """

@@ -111,7 +111,7 @@ def sweep(
 
 
 def _of(problem: ExcitationProblem, objectives: Sequence[Objective], run: SearchResult) -> np.ndarray:
-    """Return the unsmoothed values (k,) of the objectives for a search result."""
+    """Return the unsmoothed values (k,) of the objectives for the motion of a search result."""
     weighted = tuple((objective, 1.0) for objective in objectives)
     spot = replace(problem, objectives=weighted, goals=())
     motion = stretched(spot.basis().motion(run.x), run.factor)

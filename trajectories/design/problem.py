@@ -49,8 +49,9 @@ class AttainmentGoal:
         return self.weight
 
     def stated(self, value: float) -> float:
-        """Return the value F in the quantity of the goal's `words`: mean torque over its limit, share of time, or F
-        itself.
+        """Return F = value in the quantity that the goal's `words` name.
+
+        It is the mean torque over its limit, a share of time, or F itself.
         """
         if isinstance(self.objective, FrictionCoverage):
             return self.objective.wanted * (1.0 - float(np.sqrt(value)))  # of its rms shortfall
@@ -117,7 +118,7 @@ class ExcitationProblem:
         return self.stretch[0] < self.stretch[1]
 
     def basis(self) -> Basis:
-        """Return the family's basis at the sample times, then at the extra times."""
+        """Return the linear map from variables to motion at the sample times, then at the extra times."""
         times = np.append(sample_times(self.family.period, self.samples), self.extra)
         return self.family.basis(times)
 
@@ -297,8 +298,9 @@ def _matrix(objective: Excitation) -> _Matrix:
 
 
 def _summed(problem: ExcitationProblem, values: list[float]) -> tuple[float, np.ndarray]:
-    """Return the weighted sum of the objectives, condition numbers by logarithm, and its gradient (1, k) by their
-    values.
+    """Return the weighted sum of the objectives and its gradient (1, k) by their values.
+
+    Of condition numbers, the logarithm is summed.
     """
     is_log = [is_condition(objective) for objective, _ in problem.objectives]
     logs = np.array(is_log)

@@ -1,5 +1,4 @@
-"""Search from one start motion: sequential quadratic programming on the smoothed problem, in stages of rising
-sharpness.
+"""Search from one start motion: sequential quadratic programming on the problem, smoothed less from stage to stage.
 
 The first stage uses half of the samples and, where the problem has a coarse family, motions of few harmonics; this
 makes most of the progress at a fraction of the cost. The result is the best motion that satisfied all constraints at
@@ -230,8 +229,9 @@ class StartSearch:
         return last
 
     def broken(self, y: np.ndarray) -> np.ndarray:
-        """Return the times [s] at which a motion violates limits between samples by more than `max_break`; empty if
-        none.
+        """Return the times [s] at which a motion violates limits between samples by more than `max_break`.
+
+        Empty if there are none.
         """
         # of a constraint's scale: a motion that breaks it by more between the samples leads nowhere (our choice)
         max_break = 0.02
@@ -252,8 +252,8 @@ class StartSearch:
         return self._trail[low]
 
     def continued(self, y: np.ndarray, problem: ExcitationProblem, basis: Basis) -> tuple[StartSearch, np.ndarray]:
-        """Return a search in another problem that takes over this search's history, and the point y in that
-        problem's variables.
+        """Return a search in another problem with this search's history, and the point y in that problem's
+        variables.
         """
         if problem.family is not self.problem.family:
             p = self.basis.p
@@ -301,9 +301,7 @@ class StartSearch:
         )
 
     def at(self, y: np.ndarray) -> Evaluation:
-        """Return the evaluation of a point. It is computed once per point, and the best feasible point is
-        remembered.
-        """
+        """Return the evaluation of a point, computed once per point; the best feasible point is remembered."""
         key = (y.tobytes(), self.sharpness)
         if self._evaluation is None or key != self._at:
             self._evaluation = evaluate(self.problem, self.basis, y, self.sharpness)
@@ -313,9 +311,7 @@ class StartSearch:
         return self._evaluation
 
     def remember(self, y: np.ndarray, evaluation: Evaluation) -> None:
-        """Remember a feasible point if it is the best so far, and any point if it violates the constraints least so
-        far.
-        """
+        """Remember a feasible point if it is the best so far, and any point if it violates the constraints least."""
         missed = None
         if self.problem.goals:
             missed = unmet(self.problem, evaluation.values)

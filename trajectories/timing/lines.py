@@ -97,8 +97,9 @@ def _follow(forward: Forward, jacobian: Forward, start: np.ndarray, targets: np.
 
 
 def _reach(forward: Forward, jacobian: Forward, q: np.ndarray, remaining: np.ndarray, target: np.ndarray):
-    """Return joint values (n,) at a target pose (4, 4), near the joint values `remaining` (n,), and the remaining
-    error (6,).
+    """Return joint values (n,) at a target pose (4, 4), and the remaining error (6,).
+
+    The solution is the one near the joint values `remaining` (n,).
     """
     error = np.full(6, np.inf)
     max_step = 0.2  # [rad or m] of a step of any joint

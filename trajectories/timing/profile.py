@@ -16,11 +16,11 @@ TorqueLaw = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """A speed profile along a path.
+    """A speed profile along a path: ṡ² at grid points, linear in s between them.
 
     Attributes:
-        s: (K + 1,) grid on the path, rising from 0.
-        x: (K + 1,) ṡ² [1/s² in units of s]; zero at rest.
+        s: (K + 1,) grid of path parameters, rising from 0.
+        x: (K + 1,) ṡ² at the grid points [square of the unit of s, per s²]; zero at rest.
     """
 
     s: np.ndarray
@@ -45,7 +45,7 @@ class Profile:
         return float(self.times[-1])
 
     def slower(self, factor: float) -> Profile:
-        """Return the profile `factor` times slower."""
+        """Return the profile slowed down: `factor` times the duration."""
         return Profile(self.s, self.x / factor**2)
 
     def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

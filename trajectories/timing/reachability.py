@@ -73,9 +73,7 @@ class ConstraintRows:
         return cls(s, q, slope, curvature, A, B, G, limits)
 
     def speed(self, fastest_joint: float) -> float:
-        """Return the x = ṡ² up to which no joint exceeds the speed `fastest_joint` [rad/s or m/s] anywhere on the
-        path.
-        """
+        """Return the x = ṡ² up to which no joint exceeds the speed `fastest_joint` [rad/s or m/s] on the path."""
         steepest = np.abs(self.slope).max()
         return (fastest_joint / steepest) ** 2
 

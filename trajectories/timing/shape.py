@@ -51,8 +51,9 @@ def count(waypoints: np.ndarray, stray: float) -> int:
 
 
 def build(waypoints: np.ndarray, phi: np.ndarray, stray: float = 0.0) -> Path:
-    """Return the path for parameters φ: log ratios of knot intervals, then the via points' offsets as shares of
-    `stray`.
+    """Return the path for parameters φ.
+
+    φ contains log ratios of knot intervals, then the offsets of the via points as shares of `stray`.
     """
     points = checked(waypoints)
     m, n = points.shape

@@ -183,9 +183,7 @@ def _round(
 
 
 def _shares(sampled: Sampled, limits: TimingLimits) -> dict[str, np.ndarray]:
-    """Return the shares of the limits in use, (N, n) for each kind of limit; kinds of which no joint has a limit are
-    omitted.
-    """
+    """Return the shares of the limits in use, (N, n) for each kind of limit that some joint has."""
     kinds = (
         ("velocity", sampled.v, limits.velocity),
         ("acceleration", sampled.a, limits.acceleration),

@@ -119,8 +119,9 @@ def sigma_at(cell: Installation, fit: GeometricFit, q: np.ndarray) -> np.ndarray
 
 
 def _posterior(cell: Installation, fit: GeometricFit, columns: np.ndarray) -> np.ndarray:
-    """Return the posterior covariance (c, c) of the parameters `columns` (c,), from a fit's data and the prior of
-    making.
+    """Return the posterior covariance (c, c) of the parameters `columns` (c,).
+
+    It follows from the data of the fit and the prior of making.
     """
     square = np.zeros((len(columns), len(columns)))
     for number, block in enumerate(fit.blocks):

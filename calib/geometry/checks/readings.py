@@ -23,8 +23,7 @@ MIN_COPIES = 3
 
 
 def repeated_readings(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> list[Finding]:
-    """Return findings on readings that are repeated at several postures, and on targets with the readings of another
-    target.
+    """Return findings on readings repeated at several postures, and on targets with the readings of another target.
 
     Args:
         nominal: the nominal arm, with stations and tools placed.

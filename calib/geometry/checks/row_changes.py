@@ -131,8 +131,9 @@ class WhitenedRows:
 
 @dataclass(frozen=True, eq=False)
 class Subject:
-    """A part of the set-up that may have changed during the measurement: station, target, joint zero, or instrument
-    scale.
+    """A part of the set-up that may have changed during the measurement.
+
+    It is a station, a target, the zero of a joint, or the scale of an instrument.
 
     Attributes:
         code: key of the part's findings in `STEPS` and `DRIFTS`.
@@ -168,9 +169,7 @@ class RowChange:
 
     @property
     def columns(self) -> np.ndarray:
-        """Columns (m, d, k) that the change adds to the whitened matrix: the columns of `subject`, multiplied by
-        `shape`.
-        """
+        """Columns (m, d, k) that the change adds to the whitened matrix: the columns of `subject` times `shape`."""
         return self.shape[:, None, None] * self.subject.columns
 
 
@@ -229,9 +228,7 @@ def _without_gross(rows: WhitenedRows) -> WhitenedRows:
 
 
 def _subjects(fit: GeometricFit, rows: WhitenedRows) -> list[Subject]:
-    """Return the parts of the set-up that may have changed: station, instrument scale, each target, the zero of each
-    joint.
-    """
+    """Return the parts of the set-up that may have changed: station, instrument scale, targets, zeros of the joints."""
     cell = fit.cell
     table = layout(cell)
     column = {table.names[k]: number for number, k in enumerate(table.index("arm", "station", "tool"))}

@@ -49,9 +49,7 @@ def least_error(nominal: Installation, blocks: Blocks) -> np.ndarray:
 
 
 def _columns(nominal: Installation, block: Positions) -> np.ndarray:
-    """Return the columns (m, 13) of the linear position model for a block's rows, from the tip's R, t and the
-    constant 1.
-    """
+    """Return the columns (m, 13) of the linear position model for a block's rows, from the tip's R, t and 1."""
     tip = forward(nominal.chain, block.q)
     rotation = tip[:, :3, :3].reshape(-1, 9)
     return np.column_stack([rotation, tip[:, :3, 3], np.ones(len(tip))])
@@ -194,9 +192,7 @@ def _sorted_by_target(columns: np.ndarray, position: np.ndarray) -> Mixture:
 
 
 def _settled(columns: np.ndarray, position: np.ndarray, second: np.ndarray) -> Mixture:
-    """Return the rows assigned to two targets, by iteration from a first assignment `second` (m,) until none
-    changes.
-    """
+    """Return the rows assigned to two targets, iterated from a first assignment `second` (m,) until none changes."""
     distance = 0.0
     squares = np.inf
     for _ in range(MAX_ROUNDS):

@@ -144,8 +144,8 @@ class FoldStatistics:
         return UnseenErrors(np.array(squares), self.rows)
 
     def ridges(self, terms: np.ndarray) -> np.ndarray:
-        """Return the most probable prior standard deviation of each term, from all rows; 0 for a term that the data
-        drop.
+        """Return the most probable prior standard deviation of each term, from all rows; 0 for a term that is
+        switched off.
         """
         columns = self._columns(terms)
         factors = self._widths(terms) / self.coordinates.sizes[columns]
@@ -264,8 +264,9 @@ def fold_statistics(
 
 
 def _placed_anew(measured: Sequence[PoseMeasurements], held_out: Sequence[np.ndarray]) -> list[bool]:
-    """Return, for each block, whether all rows of its station are held out; its placement is then fitted to these
-    rows.
+    """Return, for each block, whether all rows of its station are held out.
+
+    The placement of such a station is fitted to the held-out rows.
     """
     fitted_stations = set()
     for block, rows in zip(measured, held_out):
@@ -427,8 +428,9 @@ class _FoldRows:
 
 
 def project_out(columns: np.ndarray, frames: np.ndarray) -> np.ndarray:
-    """Return columns (f, ...) with the columns at `frames` projected out, as if the parameters there were fitted to
-    the rows.
+    """Return the part of `columns` (f, ...) that is orthogonal to the columns at `frames`.
+
+    This has the same effect as a fit of the parameters at `frames` to the rows.
     """
     flat = columns.reshape(len(columns), -1)
     basis, size, _ = np.linalg.svd(flat[frames].T, full_matrices=False)

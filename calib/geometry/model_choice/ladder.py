@@ -49,8 +49,9 @@ Progress = Callable[[int, int, str], None]
 
 
 def _stiffness(chain: Chain, torques_known: bool) -> list[Term]:
-    """Return the terms for deflection of each joint about its axis under gravity, by known torques or by fitted
-    moments.
+    """Return the terms for deflection of each joint about its axis under gravity.
+
+    They use the gravity torques if these are known, else fitted moments.
     """
     terms: list[Term] = []
     for joint, element in enumerate(chain.moving):
@@ -84,8 +85,8 @@ def _sag(chain: Chain, number: int) -> list[Term]:
 
 
 def _coupling(chain: Chain, torques_known: bool) -> list[Term]:
-    """Return the terms that correct a joint in proportion to its own value and its neighbours': gear ratios, coupled
-    gears.
+    """Return the terms for gear ratios and coupled gears: corrections proportional to a joint's value or its
+    neighbours'.
     """
     terms: list[Term] = []
     for joint in range(chain.n):
@@ -191,8 +192,9 @@ class ModelSelection:
         return error
 
     def rigid_fit(self, measured: Sequence[PoseMeasurements], settings: Settings, bare: Chain | None) -> GeometricFit:
-        """Return the best fit without any joint corrections (for a URDF), also without those the robot had before the
-        fit.
+        """Return the best fit without any joint corrections (for a URDF).
+
+        Corrections that the robot had before the fit are also left out.
 
         Args:
             measured: the fitted blocks.
@@ -265,10 +267,10 @@ def _no_progress(done: int, total: int, task: str) -> None:
 
 @dataclass
 class _Climber:
-    """State of a model selection: the best model so far and the steps tried; other fields are arguments of
-    `select_model`.
+    """State of a model selection: the best model so far, and the steps tried.
 
     Attributes:
+        cell, measured, settings, fixed, prior, progress, seed: arguments of `select_model`.
         transfer: the partition of the rows that was requested.
         folds: that partition, with those folds split that the other rows do not determine.
         nominal: the nominal arm with its placements fitted.
@@ -306,7 +308,7 @@ class _Climber:
             self._divide_blind_folds()
 
     def _divide_blind_folds(self) -> None:
-        """Split folds that the other rows do not determine: first by regions and, where this does not suffice, by
+        """Split folds that the other rows do not determine: first by regions and, if this does not suffice, by
         single rows.
         """
         for scattered in (False, True):
@@ -471,9 +473,7 @@ class _Climber:
 
 
 def _declined(effect: UnseenErrors, error: UnseenErrors) -> str:
-    """Return the reason why an effect is not used: the change of the error on held-out rows, and the number of
-    better folds.
-    """
+    """Return why an effect is not used: the change of the error on held-out rows, and the number of better folds."""
     gain = 1.0 - effect.rms / error.rms
     if gain <= 0.0:
         return "no better on held-out rows: not used"
