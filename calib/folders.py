@@ -128,9 +128,14 @@ def _move_files(staging: Path, out: Path, ours: Collection[str]) -> None:
     fresh = sorted(path.name for path in staging.iterdir())
     with refused_as(UsageError, OSError, f"cannot write to {out}: {{}}"):
         for name in sorted(fresh, key=lambda name: name == METRICS):
+            if (staging / name).is_dir():
+                shutil.rmtree(out / name, ignore_errors=True)
             os.replace(staging / name, out / name)
         for name in set(files_of(out, ours)) - set(fresh):
-            (out / name).unlink(missing_ok=True)
+            if (out / name).is_dir():
+                shutil.rmtree(out / name)
+            else:
+                (out / name).unlink(missing_ok=True)
 
 
 ESTIMATE, COVARIANCE = "estimate.csv", "covariance.csv"

@@ -16,7 +16,7 @@ from calib.config import Tables
 from calib.data.poses.pose_lists import Targets
 from calib.errors import TaskLost, as_ours
 from calib.identification.identify_options import IdentifyOptions, IdentifySettings, options_of, read_options
-from calib.procedure.excitation import design, folder, planning
+from calib.procedure.excitation import design, folder, planning, stored_front
 from calib.procedure.excitation.settings import DEFAULT_DESIGN, DEFAULT_PLAN, ExcitationSettings, PlanSettings
 from calib.procedure.robot_kinds import Mechanism, MechanismResult, stage_of
 from calib.records import as_subclass
@@ -137,6 +137,7 @@ def design_excitation(
     limits: Tables | None = None,
     options: IdentifySettings | str | Path | None = None,
     after: DynamicsModel | str | Path | None = None,
+    pick: tuple[str | Path, int] | None = None,
     base: str | None = None,
     tip: str | None = None,
     workers: str | int = 1,
@@ -156,6 +157,8 @@ def design_excitation(
             torque rows, drive terms, couplings and payloads in them. None takes the defaults.
         after: identified dynamics to be improved by a further motion, given instead of `model`. The motion that reduces
             the σ of their parameters most is designed, and the reduction is predicted.
+        pick: folder of a design with a Pareto front, made with the same settings, and the number of the motion on the front
+            to take, instead of a search; None searches for a motion.
         workers: number of local processes, or the address of a Dask scheduler.
         progress: called with texts on the progress; None for no report.
 
@@ -167,6 +170,10 @@ def design_excitation(
 
     lost_workers: list[TaskLost] = []
     stage = stage_of(robot, "excite", base, tip)
+    picked = None
+    if pick is not None:
+        front_folder, number = pick
+        picked = stored_front.read(Path(front_folder)).with_designed(number)
     with as_ours(), ExitStack() as stack:
         model_folder = None if model is None else stack.enter_context(saved(model))
         previous_folder = None if after is None else stack.enter_context(saved(after))
@@ -191,6 +198,7 @@ def design_excitation(
             tip=tip,
             options=identify_settings,
             after=previous_folder,
+            picked=picked,
             map=crew.map_without(lost_workers),
             progress=progress,
         )

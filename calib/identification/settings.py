@@ -54,6 +54,21 @@ class Payload:
         per_mass = (*inertia, x, y, z, 1.0)
         return tuple(self.mass * value for value in per_mass)
 
+    def __str__(self) -> str:
+        """Return the stated mass and centre of mass: ``3.28 kg at 0,0,0.05``, or that the mass is unknown."""
+        mass = "mass unknown" if self.mass is None else f"{self.mass:g} kg"
+        if self.com is None:
+            return mass
+        position = ",".join(f"{coordinate:g}" for coordinate in self.com)
+        return f"{mass} at {position}"
+
+
+def mass_as_payload(value: object) -> object:
+    """Return the table of a payload that is stated by its mass alone; other values as they are."""
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return {"mass": value}
+    return value
+
 
 @dataclass(frozen=True)
 class Choices:

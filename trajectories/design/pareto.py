@@ -100,7 +100,8 @@ def sweep(
             if isinstance(run, SearchResult) and run.merit < least_merit:
                 best = run
                 least_merit = run.merit
-        if best is not None:
+        # two levels may have the same best motion
+        if best is not None and not any(np.allclose(best.values, point) for point in values):
             points.append(best)
             values.append(best.values)
         if report:
