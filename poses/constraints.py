@@ -1,11 +1,11 @@
 """Constraints on a measurement pose: tool height, distance from the axis, orientation to an instrument, line of sight.
 
-All but the line of sight are the quantities in Table 1 of the LWR4+ study. The constraints use no robot class. Each
-takes the caller's forward kinematics as a callable ``tool(q: (m, n)) -> (rotation (m, 3, 3), position (m, 3))`` in the
-frame in which the limits are given. For exact gradients each also takes ``tool_jacobian(q) -> (m, 6, n)``: velocity of
-the tool point, then angular velocity, both in the same frame. Without it the gradient is computed by central
-differences. Every constraint is smooth unless its docstring says otherwise. A constraint can be pickled if its
-callables can.
+All but the line of sight are the quantities in Table 1 of the study of the KUKA LWR4+ by Kolyubin, Shiriaev & Jubien
+(2019). The constraints use no robot class. Each takes the caller's forward kinematics as a callable ``tool(q: (m, n))
+-> (rotation (m, 3, 3), position (m, 3))`` in the frame in which the limits are given. For exact gradients each also
+takes ``tool_jacobian(q) -> (m, 6, n)``: velocity of the tool point, then angular velocity, both in the same frame.
+Without it the gradient is computed by central differences. Every constraint is smooth unless its docstring says
+otherwise. A constraint can be pickled if its callables can.
 """
 
 from collections.abc import Callable
@@ -98,8 +98,8 @@ def orientation(
 ) -> PoseConstraint:
     """Return the constraint that the tool's roll and pitch in the camera frame are within limits [rad].
 
-    R_camera^T R = Rot_z(yaw) Rot_y(pitch) Rot_x(roll). This convention is our reading of Table 1, which does not state
-    one. The constraint is not smooth where roll jumps by 2π, nor at a pitch of ±π/2.
+    R_camera^T R = Rot_z(yaw) Rot_y(pitch) Rot_x(roll). This convention is our reading of Table 1 of the study, which
+    does not state one. The constraint is not smooth where roll jumps by 2π, nor at a pitch of ±π/2.
 
     Args:
         tool: forward kinematics.

@@ -164,8 +164,9 @@ def select_poses(
       improved by `calib.poses.by_index`.
     * ``polish`` starts from the set of ``detmax`` and improves all joint values at once
       (`calib.poses.continuous.local`).
-    * ``local`` runs the same local search from one random set of candidates, as in the LWR4+ study. ``multistart`` runs
-      it from `starts` random sets (`calib.poses.continuous.multistart`), to avoid poor local optima.
+    * ``local`` runs the same local search from one random set of candidates, as Kolyubin, Shiriaev & Jubien (2019) did
+      for the KUKA LWR4+. ``multistart`` runs it from `starts` random sets (`calib.poses.continuous.multistart`), to
+      avoid poor local optima.
     * ``mlsl`` searches all joint values globally by NLopt's MLSL, then runs the local search
       (`calib.poses.continuous.global_local`).
     * ``tabu`` is IMHATR, the two-stage meta-heuristic (`calib.poses.continuous.tabu`).

@@ -1,8 +1,8 @@
 """A smooth approach from any pose to the start of a motion, within velocity, acceleration and jerk limits.
 
-Ruckig (Berscheid & Kröger 2021, an open relative of the Reflexxes library that the 2019 study used) computes the
-fastest jerk-limited motion. All joints move in proportion, so the approach is a straight line in joint space between
-its two ends. Ruckig is imported at the first call.
+Ruckig (Berscheid & Kröger 2021, an open relative of the Reflexxes library that Kolyubin, Shiriaev, Jubien 2019 used)
+computes the fastest jerk-limited motion. All joints move in proportion, so the approach is a straight line in joint
+space between its two ends. Ruckig is imported at the first call.
 """
 
 import math

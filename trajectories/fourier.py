@@ -95,8 +95,8 @@ def fourier_family(
         rest: True: velocity and acceleration are zero at t = 0 and T0 for all variables.
         start: (n,) pose at the start [rad or m]; None leaves it free.
         held: indices (from 0) of locked joints, with their values [rad or m]; None locks no joint.
-        resonance: smallest resonance frequency ω_r [rad/s]; n_f ω0 must be below it (the 2019 paper, section 4.3).
-            None: not checked.
+        resonance: smallest resonance frequency ω_r [rad/s]; n_f ω0 must be below it (Kolyubin et al. 2019, section
+            4.3). None: not checked.
         rate: sampling rate of the controller [Hz]; a period must be a whole number of samples. None: not checked.
 
     Raises:

@@ -157,8 +157,8 @@ def design_excitation(
             torque rows, drive terms, couplings and payloads in them. None takes the defaults.
         after: identified dynamics to be improved by a further motion, given instead of `model`. The motion that reduces
             the σ of their parameters most is designed, and the reduction is predicted.
-        pick: folder of a design with a Pareto front, made with the same settings, and the number of the motion on the front
-            to take, instead of a search; None searches for a motion.
+        pick: folder of a design with a Pareto front, made with the same settings, and the number of a motion on that
+            front. This motion is returned instead of a new search; None searches.
         workers: number of local processes, or the address of a Dask scheduler.
         progress: called with texts on the progress; None for no report.
 

@@ -1,8 +1,8 @@
 """IMHATR: iterative meta-heuristic with a tabu rule, in two stages.
 
-The LWR4+ study names the method after its reference [8] (most likely Daney, Papegay & Madeline, IJRR 24(6), 2005: poses
-chosen one after another, a tabu list against local minima) and gives no details. This is our reconstruction, and all
-numbers are ours:
+The study of the KUKA LWR4+ by Kolyubin, Shiriaev & Jubien (2019) names the method after its reference [8] (most likely
+Daney, Papegay & Madeline, IJRR 24(6), 2005: poses chosen one after another, a tabu list against local minima) and gives
+no details. This is our reconstruction, and all numbers are ours:
 
 1. *Construct.* Until there are m poses: draw N_c random feasible poses outside the tabu list and take the one that
    improves the index most. Improve this pose by a local search with the other poses fixed, and add it. The drawn and

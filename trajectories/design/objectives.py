@@ -220,9 +220,9 @@ class Excitation:
 class TorqueSlack:
     """Mean distance of the joint torques from their limits: 1 - mean over joints and time of |τ_j| / τ_max.
 
-    Eq. 24 of the 2019 paper requires F = mean(τ_max - |τ|) ≤ k τ_max. The slack F is *minimised*: a goal of k = 0.9
-    requires a mean torque of at least a tenth of the limit. The absolute value is smoothed as √(τ² + (ε τ_max)²) - ε
-    τ_max, ε = `smoothing`, which is never above |τ|. τ = Y χ is the motor torque; without the motor's share, the
+    Eq. 24 of Kolyubin et al. (2019) requires F = mean(τ_max - |τ|) ≤ k τ_max. The slack F is *minimised*: a goal of k =
+    0.9 requires a mean torque of at least a tenth of the limit. The absolute value is smoothed as √(τ² + (ε τ_max)²) -
+    ε τ_max, ε = `smoothing`, which is never above |τ|. τ = Y χ is the motor torque; without the motor's share, the
     torques of a light wrist could not reach such goals.
 
     Attributes:

@@ -40,7 +40,7 @@ def proposed_goals(
     guesses: tuple[np.ndarray, ...] = (),
     map: Callable = map,
 ) -> list[tuple[float, SearchResult]]:
-    """Return the optimum of each objective alone, with its motion, as initial goals (the advice of the 2019 study).
+    """Return the optimum of each objective alone, with its motion, as initial goals (Kolyubin et al. 2019).
 
     Arguments are those of `calib.trajectories.design.optimise.design`; `problem` gives family and constraints.
     """

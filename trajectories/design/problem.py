@@ -1,10 +1,10 @@
 """An excitation problem: a motion family sampled over its period, objectives or goals, and constraints, with gradients.
 
-Goal attainment (Gembicki 1974; the paper's eq. 24): min γ subject to F_i - w_i γ ≤ g_i for objectives F_i with goals
-g_i. By default w_i = |g_i|, so that γ is the relative amount by which goals are missed (negative: exceeded); w_i = 0
-makes a goal hard, that is, a constraint. The optimiser varies s with γ = e^s - 1, and goals on a condition number are
-compared by logarithm. This does not change the optimum, and keeps the problem well scaled for condition numbers up to
-10⁶ (our choice).
+Goal attainment (Gembicki 1974; Kolyubin, Shiriaev, Jubien 2019, eq. 24): min γ subject to F_i - w_i γ ≤ g_i for
+objectives F_i with goals g_i. By default w_i = |g_i|, so that γ is the relative amount by which goals are missed
+(negative: exceeded); w_i = 0 makes a goal hard, that is, a constraint. The optimiser varies s with γ = e^s - 1, and
+goals on a condition number are compared by logarithm. This does not change the optimum, and keeps the problem well
+scaled for condition numbers up to 10⁶ (our choice).
 """
 
 from collections.abc import Sequence
