@@ -1,10 +1,11 @@
 """Differences between predicted and measured positions, orientations and distances, as printed on a certificate.
+
 For predicted positions p and measured positions y:
 
     position      |y - p| where positions are measured; |mean of the socket's points - p| for sockets; distance from the
                   plane for planes; for an image the rms over its corners of the distance between seen and predicted
                   corner, measured across the line of sight at the corner's distance [m]
-    orientation   angle of R_y Rᵀ [rad]
+    orientation   angle of R_y Rᵀ [rad], R_y measured, R predicted
     distance      | |p_a - p_b| - known | for distances, bars and sockets a known distance apart; for sockets without
                   one, the deviation of |m_a - m_b| from its mean over the fixture's positions [m]
 

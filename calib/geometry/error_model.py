@@ -221,8 +221,8 @@ def _variances(precision: np.ndarray, columns: np.ndarray) -> np.ndarray:
 def _distances(q: np.ndarray, learnt: np.ndarray, levers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return squared distances (m,) [m²] of poses: from the nearest fitted pose, and from the joints' fitted ranges.
 
-    For each joint, the second distance is the largest one within which a share `NEAR_SHARE` of the fitted poses lie. A
-    few poses far from the others therefore do not count as a fitted range.
+    For each joint, the second distance is the smallest one within which a share `NEAR_SHARE` of the fitted poses lie. A
+    few poses far from the others therefore do not extend the fitted range.
     """
     nearest = KDTree(learnt * levers).query(q * levers)[0]
     count = len(learnt)

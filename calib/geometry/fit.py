@@ -333,6 +333,7 @@ def fit_with_prior(
     warm: bool = False,
 ) -> GeometricFit:
     """Return the fit of exactly the parameters `free`, which minimises squared residuals and distances from nominal.
+
     The minimised function is Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / σ_prior)².
 
     Sigmas that no file states are estimated, one per file and kind of residual (position, orientation …). The fit is

@@ -368,6 +368,7 @@ class StartSearch:
 
     def solve(self, y: np.ndarray, evaluations: int, method: Method, tolerance: float = 1e-5) -> np.ndarray:
         """Return the optimiser's last point y for the smoothed problem.
+
         With goals, the optimiser also varies s, where γ = e^s - 1.
         """
         goals = self.problem.goals

@@ -82,6 +82,7 @@ class Sampled:
 
 def dense(path: Path, profile: Profile, torque: TorqueLaw | None, per_interval: int = 8) -> Sampled:
     """Return the motion of a profile, sampled densely on each interval.
+
     Both ends of an interval are samples, since s̈ and friction jump between intervals.
 
     At rest, friction has the direction of the motion that begins or ends at this instant, which gives the larger
