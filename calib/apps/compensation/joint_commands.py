@@ -48,22 +48,22 @@ from calib.toolkit.result_folders import VALIDATED, ValidationFolder, lines_of, 
 from calib.transforms import from_xyz_rpy, invert, pose, rotation_vector
 
 # Thresholds are our choice.
-# position [m] and orientation [rad] that a command may leave
+# largest errors of a command that reaches its target, of position [m] and orientation [rad]
 TOLERANCE = (1e-6, 1e-5)
-# correction of one joint [rad or m] beyond which the arm is held back: it is near a singularity
+# largest correction of one joint [rad or m]; a larger one is limited, since the arm is near a singularity
 MAX_CORRECTION = 0.2
-# singular values of the Jacobian, smallest over largest
+# ratio of smallest to largest singular value of the Jacobian below which a pose is near a singularity
 SINGULAR = 0.02
-# further from a target than this no singularity is to blame [m]
+# largest distance from a target [m] that is explained by a singularity
 ASTRAY = 0.01
-# [rad or m]
+# amount by which joint values may exceed a limit, for rounding errors [rad or m]
 LIMIT_TOLERANCE = 1e-9
-# random starts for each target without joints
+# number of random starts for each target given without joint values
 STARTS = 24
 COMPONENTS = {6: "position and orientation", 5: "position and the direction of the tool's z axis", 3: "position only"}
-# targets that a message lists
+# largest number of targets in a message
 MAX_LISTED = 20
-# of COMMANDS.csv behind the status
+# columns of COMMANDS.csv after the status
 COLUMNS = (
     "left [mm]",
     "left [mrad]",

@@ -19,7 +19,8 @@ from calib.errors import UsageError, listing
 from calib.toolkit.chains import Controller
 from calib.transforms import invert, to_xyz_rpy
 
-# [m, or as a rotation matrix] a frame that is stated and read in the program may differ by this
+# largest difference between a frame stated by the user and the frame read from the program, in any element of their
+# matrices (positions in m)
 AGREE = 5e-5
 
 

@@ -8,17 +8,17 @@ from scipy import stats
 
 from calib.errors import Finding, finding
 
-# with the tool, and with others, that a comparison needs (our choice)
+# smallest numbers of arms for a comparison: with the tool, and with other tools (our choice)
 MIN_ARMS = 2, 3
-# between medians, above it a tool is named: 99 %, as of other findings
+# significance of the difference of medians, in sigmas, above which a tool is reported: 99 %, as for other findings
 SIGMAS = 2.6
-# times the typical distance from the median, which larger ones count as (our choice)
+# distances from the median are limited to this multiple of the typical distance (our choice)
 MAX_DISTANCE = 3.0
-# share of the degrees of freedom that remains by that (our choice)
+# share of the degrees of freedom that remains after this limitation (our choice)
 FREEDOM_SHARE = 0.8
-# [m, or of a logarithm]
+# smallest scatter, of positions [m] and of logarithms of errors
 MIN_SCATTER = 1e-6
-# of the others' error, below it a tool is not called loose (our choice)
+# smallest ratio of the arms' error with a loose tool to the error of the other arms (our choice)
 MIN_TIMES = 1.5
 
 

@@ -17,17 +17,18 @@ import numpy as np
 
 from calib.apps.joining.stream_files import Stream
 
-# by which a joint comes to rest before where it was sent, from either side [rad or m]
+# prior standard deviation of the backlash by which a joint stops short of its commanded value, from either side
+# [rad or m]
 BACKLASH = 1e-4
-# of the polygon, ends included
+# number of knots of the polygon, ends included
 KNOTS = 6
-# number of times at which a step is tried, evenly, then between the neighbours of the best
+# number of times at which a step is tried: first evenly spaced, then between the neighbours of the best of these
 COARSE_TIMES, FINE_TIMES = 120, 40
-# smallest step that is reported [s]
+# smallest step of the clock that is reported [s]
 MIN_STEP = 3e-3
-# its least size in σ, alone and beside the polygon
+# smallest size of a reported step in σ: without, and in addition to, the polygon
 CERTAIN_ALONE, CERTAIN_BESIDE_POLYGON = 5.0, 7.0
-# share of the size by which the stamps may differ from it
+# share of a step's size by which the jump of a file's time stamps may differ from it, for the file to show the step
 STAMPED = 0.5
 
 

@@ -41,33 +41,34 @@ from calib.toolkit.pose_data import Positions, take
 from calib.toolkit.statistics import gram, relevance, robust_weights, spread
 from calib.transforms import invert, rotation_vector
 
-# step of the grid of offsets that are tried first [s]
+# spacing of the offsets that are tried first [s]
 GRID = 0.05
-# lever arms by which the tip's turning counts as speed, since the target's place at the tip is unknown [m]
+# lever arms [m] that are tried to convert the tip's rotation to speed, since the target's position on the tip is
+# unknown
 LEVERS = (0.0, 0.15, 0.4)
-# number of offsets that are tried for each lever, and their least distance [s]
+# number of offsets that are tried for each lever arm, and the smallest distance between them [s]
 PEAKS, PEAK_DISTANCE = 3, 1.0
-# share of the shorter file that the longer one has, at least
+# smallest share of the shorter file that has to overlap in time with the longer one
 OVERLAP = 0.5
-# percent of the residuals that an offset is assessed by
+# percentage of the residuals, smallest first, whose rms is the misfit of an offset
 TRIMMED = 90
-# rows that placements are guessed from
+# number of rows from which placements are guessed
 PLACED = 300
-# residual of the nominal arm over the points' spread up to which a log is of the same motion
+# largest ratio of the nominal arm's residual to the spread of the points for a log of the same motion
 MAX_RATIO = 0.15
-# times the residual of the best offset, up to which another one is as good
+# an offset is as good as the best one if its residual is less than this factor times the best residual
 RIVAL = 1.3
-# prior standard deviation of a clock's drift
+# prior standard deviation of a clock's drift [s/s]
 MAX_DRIFT = 1e-3
-# difference of times by which speeds are computed [s]
+# step of the central differences by which velocities are computed [s]
 TIME_STEP = 1e-3
 # highest order of the harmonics that are fitted
 ORDERS = 6
-# most rounds of Gauss-Newton
+# largest number of Gauss-Newton iterations
 ROUNDS = 12
-# change of the offset below which the rounds end [s]
+# change of the offset below which the iteration ends [s]
 SETTLED = 1e-6
-# least and largest size of terms over their guessed size
+# smallest and largest ratio of the terms' prior standard deviations to their first guesses
 TERM_SIZES = (1e-3, 5.0)
 _NONE = np.array([], dtype=int)
 

@@ -48,19 +48,19 @@ from calib.toolkit.result_folders import lines_of
 from calib.units import TIMES
 
 METHODS = ("name", "time", "row", "geometry", "motion")
-# what the files need for each of the methods without motion
+# requirements of each method except motion, for messages
 REQUIREMENTS = ("both files need a column of names (name, pose, id …)", "of times (t)", "as many rows", "give --robot")
 
 # Thresholds are our choice.
-# distance of two readings of one pose [m], where nothing is known of their scatter
+# largest distance of two readings of one pose [m], where their scatter is not known
 MAX_DISTANCE = 1e-3
-# times the median distance of two readings of one pose, up to which they are one
+# largest distance of two readings of one pose, as a multiple of the median of such distances
 MAX_DISTANCE_RATIO = 10.0
-# degrees of freedom of a scatter that is stated as sigma
+# smallest number of degrees of freedom of a scatter that is written as sigma
 MIN_REPEATS = 5
-# before and after a point the arm stands [s], moving at most
+# time before and after a point during which the arm has to stand still [s]
 STANDSTILL = 0.25
-# of a joint's whole travel
+# largest motion of a joint during this time, as a share of the joint's whole travel
 MAX_MOTION = 1e-3
 _MEASURED = re.compile(r"[xyz]\d*(_meas|_measured)?")
 

@@ -24,23 +24,23 @@ from calib.toolkit.installations import install
 from calib.toolkit.pose_data import PoseMeasurements
 
 # Thresholds are our choice.
-# of the arm's length: what nominal errors leave in the right order, at most
+# largest misfit of the right order due to the errors of the nominal arm, as a share of the arm's length
 MAX_MISFIT = 0.02
-# below which an order is not checked: placing instrument and target takes all they say
+# smallest number of points to check an order: fewer points suffice only to place instrument and target
 MIN_POINTS = 6
-# below which no order is looked for: of 10 points in 40 poses, one in twelve was wrong
+# smallest number of points to search for an order: of orders found for 10 points in 40 poses, one in twelve was wrong
 MIN_FOUND = 12
-# another pose is possible if its point is nearer than so many rms residuals
+# another pose is possible if its predicted point is nearer than this number of rms residuals
 AMBIGUOUS = 3.0
-# tools to start from, measured triples, placements that are refined
+# number of tool positions to start from, of triples of measured points, and of placements that are refined
 STARTS, TRIPLES, REFINED = 6, 12, 8
-# tried where these fail [m]
+# tool positions that are tried where those do not lead to an order [m]
 TOOLS = [np.array(tool) for tool in product((-0.1, 0.0, 0.1), repeat=3)]
-# of an assignment and a placement
+# largest number of iterations of assignment and placement
 MAX_ROUNDS = 10
-# points that a placement is scored by
+# number of points by which the misfit of a placement is computed
 SCORED = 15
-# of poses that are compared with one triple of points
+# largest number of triples of poses that are compared with one triple of points
 MAX_TRIPLES = 20_000
 
 

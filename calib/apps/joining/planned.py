@@ -26,9 +26,9 @@ from calib.toolkit.pose_data import (
 )
 from calib.toolkit.result_folders import joints_of, lines_of
 
-# between a commanded and a reached joint position [rad or m] (our choice)
+# standard deviation of the difference between commanded and reached joint position [rad or m] (our choice)
 SIGMA_JOINT = 1e-4
-# of the differences that propagate it [rad or m]
+# step of the central differences that propagate this standard deviation to the tip [rad or m]
 STEP = 1e-6
 
 

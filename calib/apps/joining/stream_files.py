@@ -24,17 +24,17 @@ from calib.toolkit.recordings import GAP
 from calib.units import TIMES
 
 # Thresholds are our choice.
-# rows read at once
+# number of rows that are read at once
 PIECE = 50_000
-# rows held, at most: beyond them every second one
+# largest number of rows in memory; beyond it, every second row is dropped
 HELD = 500_000
-# time between two rows of a stream, at most [s]
+# largest time between two rows of a stream [s]
 SLOWEST = 0.2
-# of a stream
+# smallest number of usable rows of a stream
 MIN_ROWS = 200
-# by which a clock that was restarted goes back, at least [s]
+# smallest jump back of a clock that was restarted [s]
 RESTART = 1.0
-# reasons for which rows are left out
+# reasons for which rows are ignored, for messages
 DAMAGED, LATE = "damaged, empty or not seen", "with a time not after the row before"
 
 

@@ -41,23 +41,23 @@ from calib.toolkit.result_folders import joints_of, lines_of
 from calib.toolkit.statistics import autocorrelation, inflation, spread
 from calib.units import JOINT
 
-# time between the rows that are held, of instrument and log [s]
+# smallest time between the rows in memory, of the instrument and of the log [s]
 RESOLUTION, LOG_RESOLUTION = 0.004, 0.008
-# travel of a joint [rad or m] and of the points [m]
+# smallest travel of some joint [rad or m], and of the points [m]
 MIN_MOTION = 1e-3
-# rows that clock and geometry are fitted to first
+# number of rows to which clock and geometry are fitted first
 FITTED = 1500
-# robust sigmas
+# number of robust sigmas from which on a residual is an outlier
 OUTLIER = 6.0
-# of the table
+# smallest and largest number of rows of the table
 MIN_ROWS, MAX_ROWS = 20, 20_000
-# rows that are searched at once for one in which the arm has moved
+# number of rows that are searched at once for the next row at which the arm has moved
 PIECE = 64
-# by which a joint moves at least between two rows of the table [rad or m]
+# smallest motion of some joint between two rows of the table [rad or m]
 MOVED = 1e-3
-# by which a clock may leave a line of offset and drift [s]
+# largest deviation of a clock from a line of offset and drift [s]
 MAX_WANDER = 5e-3
-# times that σ of a fit to all rows would be too small
+# factor by which σ of a fit to all rows would be too small, from which on it is reported
 WORTH_SAYING = 1.05
 
 
