@@ -165,10 +165,21 @@ def log(path: str, robot: str, motion: str, what: str = "torque", load: str = ""
         file.write_text(head.replace("tau_", "current_").replace("[Nm]", "[A]") + "\n" + rows)
 
 
+def degrade(log: str, path: str, noise: str = "1") -> None:
+    """Copy a log and add white noise [mrad] to its positions, as a bad encoder would: the torques stay as they are."""
+    head, rows = Path(log).read_text(encoding="utf-8").split("\n", 1)
+    names = head.split(",")
+    values = np.loadtxt(rows.splitlines(), delimiter=",")
+    positions = [name.startswith("q_") for name in names]
+    sigma = np.degrees(1e-3 * float(noise))
+    values[:, positions] += sigma * np.random.default_rng(0).normal(size=(len(values), sum(positions)))
+    write_numbers(path, names, values)
+
+
 def platform(folder: str) -> None:
     """Write a DualV's files: encoder readings with platform poses, logs without and with a payload of 5.37 kg.
 
-    The true legs are 1 mm and 1 mrad (1 sigma) off their nominal in the poses; the torques are the model's, with noise.
+    The true legs are 1 mm and 1 mrad (1 sigma) off their nominal; the torques are the model's, with noise.
     """
     known, place, rng = find("dualv").mechanism, Path(folder), np.random.default_rng(0)
     motors = known.robot.joint_names
@@ -179,7 +190,7 @@ def platform(folder: str) -> None:
     head = [*(f"{name} [deg]" for name in motors), "x [mm]", "y [mm]", "rz [deg]"]
     write_numbers(place / "measured.csv", head, np.column_stack([np.degrees(q), 1e3 * x[:, :2], np.degrees(x[:, 2])]))
 
-    model = make_parallel_model(known, ["Fv Fc"], v0=0.05, payloads=["plate"])
+    model = make_parallel_model(true, ["Fv Fc"], v0=0.05, payloads=["plate"])
     values = np.concatenate([model.known_parameters(), np.tile([0.05, 0.3], 4)])
     values[model.names.index("Mplate")] = 5.37
     t, order = np.arange(1000) / 1000.0, 2 * np.pi * np.array([1.5, 2.5, 4.0, 5.5])[:, None, None]
@@ -190,7 +201,7 @@ def platform(folder: str) -> None:
         motion = plan.motion(*((size * part).sum(axis=0) for part in (
             np.sin(angle), order * np.cos(angle), -(order**2) * np.sin(angle)
         )))  # fmt: skip
-        q = motion.posture.q[:, known.robot.actuated] + 1e-5 * rng.normal(size=(len(t), 4))
+        q = motion.posture.q[:, true.robot.actuated] + 1e-5 * rng.normal(size=(len(t), 4))
         tau = plan.torques(motion) + 0.5 * rng.normal(size=q.shape)
         head = ["t [s]", *(f"{name}_q [deg]" for name in motors), *(f"{name}_tau [Nm]" for name in motors)]
         write_numbers(place / f"{name}.csv", head, np.column_stack([t, np.degrees(q), tau]))
