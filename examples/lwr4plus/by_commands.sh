@@ -28,3 +28,7 @@ cat two_loads.toml loop.toml > iv.toml
 calib identify fit B.csv B_loaded.csv --options iv.toml --method iv --excitation B --validate other.csv --validate other_loaded.csv --no-plots --out iv
 calib plan fit --model both --waypoints waypoints.csv --no-plots --out plan
 calib export both --into calibrated
+printf 'rows = "both"\nfriction = "standard"\n' > short.toml
+(cat short.toml; echo 'prior = "none"') > short_plain.toml
+calib identify fit other.csv@2:5 --options short.toml --validate B.csv --no-plots --out short
+calib identify fit other.csv@2:5 --options short_plain.toml --validate B.csv --no-plots --out short_plain
