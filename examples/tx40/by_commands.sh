@@ -7,7 +7,12 @@ set -euo pipefail
 examples=$(cd "$(dirname "$0")/.." && pwd)
 mkdir -p "${1:-tx40-by-commands}" && cd "${1:-tx40-by-commands}"
 
-cat > loop.toml <<'EOF'
+filter=$'[filter]\ncutoff = 60.0\nband = 20.0\n'                                  # too wide for 1 mrad of noise
+printf '%s' "$filter" > wide.toml
+printf '%s[constraints]\nsigns = true\n' "$filter" > signs.toml
+printf 'rows = "power"\n' > power.toml
+cat > loop.toml <<EOF
+$filter
 [loop]                        # gains of the controller, at the joint: N m/rad, N m s/rad
 controller = "pd"
 kp = [2920, 3034, 472, 104, 103, 30]
@@ -15,8 +20,6 @@ kd = [93, 97, 15, 3.3, 3.3, 0.95]
 velocity_cutoff = 60
 feedforward = "cad"
 EOF
-printf '[constraints]\nsigns = true\n' > signs.toml
-printf 'rows = "power"\n' > power.toml
 
 calib excite tx40 --period 10 --goal normalised=6 --starts 1 --no-outlook --no-plots --out motion
 python "$examples/practice.py" log run.csv tx40 motion
@@ -25,7 +28,8 @@ python "$examples/practice.py" degrade run.csv degraded.csv 1
 
 identify() { calib identify tx40 "$1" --validate other.csv --friction standard --no-plots "${@:2}"; }
 identify run.csv --out ls                                                         # clean: least squares
-identify degraded.csv --out degraded_ls                                           # degraded: biased
-identify degraded.csv --method iv --options loop.toml --excitation motion --out degraded_iv
-identify degraded.csv --method pc-wls --options signs.toml --out degraded_pc      # constraints do not cure the bias
-identify run.csv --options power.toml --out power
+identify degraded.csv --out filtered                                              # degraded: filters by the data
+identify degraded.csv --options wide.toml --out degraded_ls                       # filters too wide: biased
+identify degraded.csv --options signs.toml --method pc-wls --out degraded_pc      # constraints do not cure that
+identify degraded.csv --options loop.toml --method iv --excitation motion --out degraded_iv
+identify run.csv --options power.toml --out power                                 # one row per sample: power
