@@ -10,8 +10,7 @@ from typing import Annotated
 from unicodedata import category
 
 from calib.config import strict
-from calib.config_types import Checked, Expect, OneOf, Real, Text, Typed
-from calib.procedure.excitation.settings import Front, Goal, Period
+from calib.config_types import Checked, Expect, OneOf, Real, Text, Typed, Whole
 
 CAMERA = ("mounting", "lens", "board", "carried", "stands")
 CELL = ("instrument_at", "cone", "facing", "box", "obstacles", *CAMERA)
@@ -134,9 +133,9 @@ class Answers:
     dynamics: Annotated[bool, Typed("--dynamics/--geometry-only")] | None = None
     torques: Torques | None = None
     payloads: tuple[str, ...] = ()
-    goals: tuple[Goal, ...] = ()
-    period: Period | None = None
-    front: Front | None = None
+    goals: tuple[str, ...] = ()
+    period: Annotated[float, Real(above=0.0, most=3600.0, unit="s")] | None = None
+    front: Annotated[int, Whole(0, 1000)] | None = None
     tolerance_mm: Tolerance | None = None
     tolerance_percent: Tolerance | None = None
     program: Text | None = None

@@ -38,14 +38,19 @@ def split_goal(text: str) -> tuple[str, float]:
     return name, value
 
 
-def _goal(text: object, aims: tuple[str, ...] = AIMS) -> object:
+def checked_goal(text: object, aims: tuple[str, ...] = AIMS) -> object:
+    """Return the text of a goal after checking its name and number; anything but a text is returned as it is.
+
+    Raises:
+        UsageError: for an unknown name, or a missing number.
+    """
     if isinstance(text, str) and text not in aims:
         split_goal(text)
     return text
 
 
-Goal = Annotated[str, Checked(_goal)]
-HardGoal = Annotated[str, Checked(lambda text: _goal(text, ()))]
+Goal = Annotated[str, Checked(checked_goal)]
+HardGoal = Annotated[str, Checked(lambda text: checked_goal(text, ()))]
 Rate = Annotated[float, Real(above=0.0, most=1e5, unit="Hz")]
 Period = Annotated[float, Real(above=0.0, most=3600.0, unit="s")]
 Front = Annotated[int, Whole(0, 1000)]

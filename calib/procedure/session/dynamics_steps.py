@@ -204,7 +204,7 @@ def _design(
         if designed.front is not None:
             count = len(designed.front.values)
             choose = command_line("next", session.folder, "--pick", "N")
-            table = session.path("6-excitation/training/front.csv")
+            table = session.path("6-excitation/training") / stored_front.TABLE
             notes.append(Note(f"{name}: {count} motions to choose from ({table}): {choose}", is_warning=True))
         remarks = [*designed.inputs.limits.bounds.lines()]
         remarks += [note for note in designed.notes if note not in designed.doubts]

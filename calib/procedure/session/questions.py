@@ -15,7 +15,7 @@ from calib.data.images.lens import read_lens
 from calib.data.poses import BOARD, IMAGES, IN_HAND, TO_HAND
 from calib.errors import CalibError, UsageError, one_of, refused_as, require
 from calib.procedure.answers import CAMERA, CELL, Answers, CertificateSection
-from calib.procedure.excitation.settings import DEFAULT_DESIGN
+from calib.procedure.excitation.settings import DEFAULT_DESIGN, checked_goal
 from calib.procedure.measuring.constraints_file import AXES, ConstraintsFile
 from calib.procedure.session.settings import NOTHING, InstrumentSection
 from calib.records import FieldValues
@@ -199,6 +199,8 @@ def checked(answers: Answers) -> FieldValues:
     if of_camera and _measures(answers) != IMAGES:
         raise CalibError(f"--{of_camera[0]} applies to a camera that takes images; the instrument is {instrument}")
     dynamics = answers.dynamics is not False
+    for goal in answers.goals:
+        checked_goal(goal)
     of_dynamics = {
         "payload": answers.payloads,
         "torques": answers.torques,
