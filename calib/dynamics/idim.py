@@ -339,8 +339,9 @@ class IdentificationModel:
         return np.array([*kept_first, *drive_columns, *kept_last, *payloads], dtype=int)
 
     def load_cases(self) -> Loads:
-        """Return the load cases for choosing base columns: all payloads, and none; one case for a model without
-        payloads.
+        """Return the load cases for choosing base columns: all payloads, and none.
+
+        A model without payloads has a single case.
         """
         if self.inertial and np.any(self.bodies.kinds == FIXED):
             return (None, ())

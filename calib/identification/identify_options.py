@@ -112,7 +112,7 @@ USED = 600_000
 
 
 def _no_zero(value: object) -> object:
-    """Refuse a list of numbers with a zero."""
+    """Raise a ValueError for a list of numbers that contains a zero; return any other value unchanged."""
     if isinstance(value, list):
         for number in value:
             if type(number) in (int, float) and number == 0:
@@ -225,7 +225,7 @@ class IdentifyOptions:
     source: str = ""
 
     def file_settings(self, path: str | Path) -> FileSettings:
-        """Return the settings of a recording (or a cut of one), with the torques that the model's rows explain."""
+        """Return the settings of a recording (or a cut of one), including which torques its rows need."""
         settings = own_table(self.files, parse_cut(str(path))[0]) or self.every
         rows = self.settings.torque_rows
         samples = settings.recording.samples or USED
@@ -247,7 +247,11 @@ def read_options(path: str | Path | None = None) -> IdentifyOptions:
 
 
 def parse_options(table: Mapping[str, object], source: str = "options") -> IdentifyOptions:
-    """Return the options in a parsed TOML table; `source` names the file in messages."""
+    """Return the options in a parsed TOML table; `source` names the file in messages.
+
+    Raises:
+        UsageError: for an unknown key or an invalid value.
+    """
     for key in table.keys() & REMOVED.keys():
         message = REMOVED[key]
         refuse_option(f"{source}: {key}", message)
@@ -263,7 +267,7 @@ def options_of(keys: IdentifySettings, source: str = "settings") -> IdentifyOpti
     """Return the options of an identification from the keys of an options file.
 
     Args:
-        keys: of an options file.
+        keys: keys and values of the options file.
         source: name of the file in messages.
 
     Raises:
