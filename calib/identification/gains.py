@@ -81,7 +81,7 @@ class DriveGains:
 
     @property
     def told(self) -> tuple[str, ...]:
-        """Status of each gain: ``told`` (identified), ``not told``, or ``reference`` (the others are relative to it)."""
+        """Status of each gain: ``told`` (identified), ``not told``, or ``reference`` (others are relative to it)."""
         status = []
         for joint, (gain, sigma) in enumerate(zip(self.gains, self.sigma)):
             if joint in self.own:

@@ -209,11 +209,12 @@ class IdentifyOptions:
 
     Attributes:
         settings: settings of the identification.
-        every, files: settings of all recordings, and of single ones.
-        slow: see the module; None: the default share.
-        gain_pair: recordings that identify the drive gains.
-        accept: findings that do not affect the verdict on the model, see `FINDINGS`.
-        source: the file, for messages.
+        every, files: settings of all recordings, and of single ones by file name.
+        slow: speed below which a joint counts as at rest, as a share of its peak speed or one speed per joint; None:
+            the default share.
+        gain_pair: recordings that identify the drive gains; None without any.
+        accept: findings that do not affect the verdict on the model, some of `FINDINGS`.
+        source: name of the file in messages.
     """
 
     settings: IdentificationSettings = field(default_factory=IdentificationSettings)
@@ -236,7 +237,7 @@ class IdentifyOptions:
 
 
 def read_options(path: str | Path | None = None) -> IdentifyOptions:
-    """Read the options file at `path`; the defaults without one.
+    """Return the options in the file at `path`; None: the default options.
 
     Raises:
         UsageError: for a missing file, invalid TOML, an unknown key, or an invalid value.

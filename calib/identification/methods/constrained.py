@@ -232,9 +232,7 @@ class _Planes:
         require(rank < len(self.free), f"equalities fix all {rank} parameters: nothing remains to be estimated")
 
     def optimum(self, active: np.ndarray) -> Constrained:
-        """Return the optimum under all equalities and the inequalities marked in `active` (c,), as if these were
-        equalities.
-        """
+        """Return the optimum under all equalities and the inequalities marked in `active` (c,), taken as equalities."""
         equalities = np.ones(len(self.sides) - self.count, dtype=bool)
         binding = np.append(active, equalities)
         normals = self.normals[binding]

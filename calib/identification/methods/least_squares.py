@@ -63,7 +63,7 @@ class LeastSquares(Method):
 
 
 def weighed(problem: IdentificationProblem) -> tuple[np.ndarray, np.ndarray]:
-    """Return the standard deviation and variance inflation (rows,) of a problem's residuals after WLS without a prior."""
+    """Return standard deviation and variance inflation (rows,) of a problem's residuals after WLS without prior."""
     pooled, noise = problem.pooled, problem.noise
     if noise is None:
         std = settled_std(pooled)

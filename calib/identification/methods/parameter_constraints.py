@@ -66,8 +66,7 @@ class Constraints(Frozen):
     tangents: tuple[str, ...] = ()
 
     def solve(self, factor: np.ndarray, free: np.ndarray | None = None) -> Constrained:
-        """Return argmin ½ ‖R β - z‖² under these constraints, as `calib.identification.methods.constrained.within`
-        does.
+        """Return argmin ½ ‖R β - z‖² under these constraints, computed by `constrained.within`.
 
         Args:
             factor: (p + 1, p + 1) upper triangle [R z; 0 ρ].
@@ -135,9 +134,7 @@ class Constraints(Frozen):
         free = np.append(least_squares, np.zeros(m))
 
         def solve(triangle: np.ndarray, rows: np.ndarray, lower: np.ndarray) -> Constrained:
-            """Return the optimum of the parameters and m further unknowns, under further inequalities rows · b >=
-            lower.
-            """
+            """Return the optimum of parameters and m further unknowns, under more inequalities rows · b >= lower."""
             wider = np.pad(self.matrix, ((0, 0), (0, m)))
             names = ("",) * len(rows) + self.names
             matrix = np.vstack([rows, wider])

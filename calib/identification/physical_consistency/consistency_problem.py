@@ -152,7 +152,7 @@ class BodyCost:
 
 
 def make_problem(information: Information, references: PriorBodies) -> BodyCost:
-    """Return the cost function of an identified model; prior sizes of drive terms are derived from the recorded torque."""
+    """Return the cost function of an identified model; the recorded torque gives prior sizes of drive terms."""
     model = information.dynamics.model
     inertial = 10 * model.bodies.count
     matrix = information.factor[:, :-1]
@@ -242,7 +242,10 @@ def _euclidean_prior(problem: BodyCost, pull: float) -> np.ndarray:
 
 
 def blame(problem: BodyCost, information: Information, count: int = 3) -> tuple[tuple[str, float], ...]:
-    """Return the `count` bodies and terms whose constraints cost most: name, and the distance without this constraint."""
+    """Return the `count` bodies and terms whose constraints cost most, each with the distance without its constraint.
+
+    The first entry of a pair is the name; distances are Mahalanobis distances from the data's optimum.
+    """
     model = information.dynamics.model
     constraints = [(f"body {label}", i) for i, label in enumerate(model.bodies.labels)]
     for k, term in enumerate(model.columns):

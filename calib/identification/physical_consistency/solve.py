@@ -413,7 +413,7 @@ def _bodies(problem: BodyCost, values: np.ndarray) -> np.ndarray:
 
 
 def _scaled(problem: BodyCost, pseudo: np.ndarray) -> np.ndarray:
-    """Return scaled pseudo-inertias L⁻¹ P L⁻ᵀ (B, 4, 4) with P⁰ = L Lᵀ, which are definite if P is, and of order one."""
+    """Return scaled pseudo-inertias L⁻¹ P L⁻ᵀ (B, 4, 4), P⁰ = L Lᵀ, which are of order one and definite if P is."""
     inverse = np.linalg.inv(np.linalg.cholesky(problem.references))
     return inverse @ pseudo @ inverse.transpose(0, 2, 1)
 
