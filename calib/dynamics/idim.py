@@ -91,7 +91,7 @@ class IdentificationModel:
 
     @property
     def sides(self) -> tuple[str, ...]:
-        """Side of each of the p columns (``bodies``, ``link`` or ``motor``), as `TorqueRows` needs it."""
+        """Kind of each of the p columns: ``bodies``, or the side ``link`` or ``motor`` of a drive term."""
         term_sides = [term.side for term in self.columns]
         return (*([BODIES] * self.inertial), *term_sides)
 

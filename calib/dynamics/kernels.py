@@ -130,7 +130,7 @@ def cross(a, b):
 
 @njit(**JOINED)
 def inertia_times(J, a):
-    """Return J a, J being the symmetric matrix of the six values XX, XY, XZ, YY, YZ, ZZ."""
+    """Return J a, where J is the symmetric matrix with the six entries XX, XY, XZ, YY, YZ, ZZ."""
     x = dot((J[0], J[1], J[2]), a)
     y = dot((J[1], J[3], J[4]), a)
     z = dot((J[2], J[4], J[5]), a)

@@ -70,7 +70,7 @@ class PathDynamics:
         return by_acceleration, by_square_of_speed, gravity
 
     def rigid(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the torques (N, n) without friction."""
+        """Return the torques (N, n) without friction for a motion q, v, a (N, n)."""
         return self.regressor(q, v, a)[:, -self.n :] @ self.parameters
 
     def friction(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:

@@ -106,7 +106,7 @@ class TorqueRows:
 
     @property
     def with_motors(self) -> bool:
-        """Whether the last rows are the complete motor torques, one per joint."""
+        """Whether the last n rows are the complete motor torques (bodies and all drive terms), one per joint."""
         block = self.blocks[-1]
         return self.projection is None and block.motor == 1.0 and block.sensor == 0.0 and BODIES in block.sides
 

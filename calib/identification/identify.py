@@ -1,4 +1,4 @@
-"""Identification of a model from cases: base parameters, selected friction, estimate with covariance, prediction."""
+"""Identification of a model from recordings: base parameters, selected friction, and estimate with covariance."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -570,7 +570,7 @@ def _takes_prior(method: Method, model: RegressorModel, settings: Identification
 
 
 def _essential(fit: MethodEstimate, settings: IdentificationSettings) -> Elimination | None:
-    """Return the elimination of parameters, or None if it is not requested."""
+    """Return the elimination to the essential parameters; None if it is not requested."""
     if settings.essential == "none":
         return None
     data, std, inflation = fit.testable()

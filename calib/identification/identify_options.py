@@ -163,7 +163,7 @@ class FileSettings:
 @strict
 @dataclass(frozen=True)
 class GainPair:
-    """Recordings without and with a payload of known mass, by file name."""
+    """Recordings without and with a payload of known mass, by file name, from which drive gains are identified."""
 
     unloaded: Texts
     loaded: Texts

@@ -140,7 +140,7 @@ class Prior:
         return np.hstack([inverse, np.zeros((len(unit), 1))])
 
     def widened(self, count: int) -> np.ndarray:
-        """Return the prior's rows with `count` zero columns inserted after the base columns."""
+        """Return the prior's whitened rows (b, b + count + 1) with `count` zero columns after the base columns."""
         return np.insert(self.rows, [len(self.deviation)] * count, 0.0, axis=1)
 
     def resting(self, covariance: np.ndarray) -> np.ndarray:

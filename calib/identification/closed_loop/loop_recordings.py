@@ -132,7 +132,11 @@ def take(case: Case, part: slice) -> Case:
 
 
 def _check_reference(motion: Motion) -> None:
-    """Raise an error if a motion's reference is missing, belongs to another motion, or is in degrees."""
+    """Raise an error if a motion's reference is missing, that of another motion, in degrees, or a copy of the motion.
+
+    Raises:
+        MeasurementError: in these cases.
+    """
     if motion.q_ref is None:
         refuse_data(
             motion.file,

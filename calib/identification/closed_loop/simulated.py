@@ -1,4 +1,4 @@
-"""Methods that simulate the closed loop of a recording: instrumental variables, and DIDIM."""
+"""Methods that simulate the closed loop of a recording: instrumental variables (IV), and DIDIM."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace

@@ -141,7 +141,7 @@ class Samples:
 
     @property
     def joints(self) -> np.ndarray:
-        """Number of rows in use per sample (N,)."""
+        """Number of joints whose rows are in use, per sample (N,)."""
         return self.present.sum(axis=1)
 
 

@@ -67,7 +67,7 @@ class Information(Frozen):
         return float(np.sum((scaled @ solution - target) ** 2))
 
     def distance(self, standard: np.ndarray) -> float:
-        """Return the Mahalanobis distance of standard parameters (p,) from the data's optimum, in sigmas."""
+        """Return the Mahalanobis distance of standard parameters (p,) from the data's optimum, in standard deviations."""
         base_values = self.transform @ standard
         residual = self.factor[:, :-1] @ base_values - self.factor[:, -1]
         square = float(residual @ residual) - self.best

@@ -330,7 +330,7 @@ def cost(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
 
 
 def derivatives(problem: BodyCost, gamma: float, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return gradient (p,) and Hessian (p, p) of the cost."""
+    """Return gradient (p,) and Hessian (p, p) of the cost at parameters `values` (p,)."""
     columns = problem.factor[:, :-1]
     target = problem.factor[:, -1]
     slope = columns.T @ (columns @ values - target)

@@ -1,4 +1,4 @@
-"""Methods for errors of known size: generalised TLS (noise in the columns of W), and set membership (bounded errors)."""
+"""Methods for errors of known size: generalised TLS (noise in the columns of W), set membership (bounded errors)."""
 
 from dataclasses import dataclass, replace
 

@@ -141,7 +141,7 @@ class NoisyStates:
 
 
 def noisy_states(problem: IdentificationProblem, model: IdentificationModel) -> NoisyStates:
-    """Return all samples of a problem, with the covariance of the noise in q, v and a."""
+    """Return all samples of a problem, with the covariance of the noise in q, v and a of each recording."""
     samples, (model, columns) = samples_of(problem), with_friction(problem, model)
     is_smooth = [term is None or term.form.slopes for term in problem.terms]
     smooth = np.array(is_smooth, dtype=bool)

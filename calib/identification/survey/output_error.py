@@ -151,7 +151,7 @@ class _Comparison:
 
     @property
     def rows(self) -> TorqueRows:
-        """Kind of the problem's torque rows."""
+        """Torque rows of the problem's model."""
         return self.problem.model.torque_rows
 
     def whole(self, values: np.ndarray, inertia: np.ndarray) -> np.ndarray:

@@ -159,7 +159,7 @@ def cut(rows: ObservationRows, part: slice) -> ObservationRows:
 
 
 def inverted(upper: np.ndarray) -> np.ndarray:
-    """Return the inverse of an upper triangular matrix (p, p) whose columns have different units."""
+    """Return the inverse of an upper triangular matrix (p, p), computed with columns scaled to unit norm."""
     unit = np.linalg.norm(upper, axis=0)
     identity = np.eye(len(unit))
     inverse = np.asarray(scipy.linalg.solve_triangular(upper / unit, identity))
