@@ -378,7 +378,7 @@ def _describe(model: RegressorModel, split: ColumnSplit, factor: np.ndarray, sam
 
 
 def _require_same(base: Base, model: RegressorModel) -> None:
-    """Raise `CalibError` if the base parameters are those of another model."""
+    """Raise `CalibError` if the base parameters were computed for another model."""
     if (base.rows, base.standard) != (model.torque_rows.name, model.names):
         raise CalibError("the base parameters belong to another model: rows or parameter names differ")
 

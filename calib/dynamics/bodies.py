@@ -216,7 +216,7 @@ def _assemble(
     gravity: np.ndarray,
     n: int,
 ) -> Bodies:
-    """Return the bodies with read-only arrays, and compute the arrays `paths`, `links`, `constants` and `order`."""
+    """Return `Bodies` with read-only arrays; `paths`, `links`, `constants` and `order` are computed."""
     count = len(labels)
     paths = np.full((count, n), -1)
     depths = np.zeros(count, dtype=int)

@@ -69,7 +69,7 @@ class DriveTerm:
 
     @property
     def nonnegative(self) -> bool:
-        """Whether the parameter cannot be negative physically; the inertia of a coupling may be negative."""
+        """Whether the parameter must not be negative for physical reasons; a coupling's inertia may be negative."""
         return self.form.nonnegative and (self.form.dissipative or self.joint is not None)
 
     @property

@@ -86,7 +86,7 @@ def _unjoint(links, i, rate, motion, slopes):
 
 @njit(**OPTIONS)
 def _unadvance(links, i, rate, frames, motion, slopes):
-    """Add the derivatives by body i's motion to those of its parent; return the derivative by the joint position."""
+    """Add body i's motion derivatives to its parent's; return the derivative by the joint position."""
     p = links[i, PARENT] + 1
     h = i + 1
     by_amount = 0.0
@@ -119,7 +119,7 @@ def _unadvance(links, i, rate, frames, motion, slopes):
 
 @njit(**OPTIONS)
 def _uncarry(links, i, frames, twists, bars):
-    """Add the derivatives by body i's twists to those of its parent; return the derivative by the joint position."""
+    """Add body i's twist derivatives to its parent's; return the derivative by the joint position."""
     p = links[i, PARENT]
     by_amount = 0.0
     twist = twists[i + 1]

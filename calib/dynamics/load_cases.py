@@ -31,7 +31,7 @@ class LoadCases(BaseModel):
 
     @property
     def limited(self) -> np.ndarray:
-        """Indices (loads, n) of the rows to which torque limits apply: those of the motor torques.
+        """Indices (loads, n) of the rows to which torque limits apply: the motor torques.
 
         In a model of joint torque sensors alone, they are the rows of the sensors.
         """

@@ -59,7 +59,7 @@ class RegressorModel(Protocol):
 
     @property
     def inertial(self) -> int:
-        """Number of body parameters, which precede those of the drives."""
+        """Number of body parameters, which precede the drive parameters."""
         ...
 
     @property

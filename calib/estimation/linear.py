@@ -48,7 +48,7 @@ def ols(data: Triangles, inflation: np.ndarray | None = None) -> LinearFit:
     This covariance is correct if all groups of rows have the same noise; otherwise use `wls`.
 
     Args:
-        data: triangles of W and y.
+        data: R factors of [W y].
         inflation: (g,) variance inflation >= 1 of each group, explained in the module's docstring; None: every row is
             independent.
 
@@ -64,7 +64,7 @@ def wls(data: Triangles, std: np.ndarray | None = None, inflation: np.ndarray | 
     Kolyubin et al. (2019), eq. 22 and 25; the RSD of eq. 26 is ``fit.estimate.rsd``.
 
     Args:
-        data: triangles of W and y, one group of rows per standard deviation.
+        data: R factors of [W y], one group of rows per standard deviation.
         std: (g,) noise standard deviation σ_g of each group in units of y; None: `settled_std`. Kolyubin et al. use
             `subsystem_std`.
         inflation: (g,) variance inflation >= 1 of each group, explained in the module's docstring; None: every row is
@@ -84,7 +84,7 @@ def ridge(data: Triangles, mean: np.ndarray, covariance: np.ndarray, std: np.nda
     The covariance of the result is that of the posterior; its condition numbers are those of data and prior together.
 
     Args:
-        data: triangles of W and y.
+        data: R factors of [W y].
         mean: (p,) prior mean.
         covariance: (p, p) prior covariance; an infinite diagonal entry means no prior knowledge of that parameter.
         std: (g,) noise standard deviation of each group in units of y; None: `settled_std`, for which the data alone
@@ -140,7 +140,7 @@ def settled_std(data: Triangles, tolerance: float = 1e-6, limit: int = 200) -> n
     estimate (Patterson & Thompson 1971). The iteration starts from `subsystem_std`.
 
     Args:
-        data: triangles of W and y.
+        data: R factors of [W y].
         tolerance: largest relative change of any σ_g at which the iteration ends.
         limit: largest number of iterations.
 
@@ -168,7 +168,7 @@ def _fit(data: Triangles, std: np.ndarray, inflation: np.ndarray | None, stated:
     """Return the weighted least-squares fit with the rows of group g divided by std[g].
 
     Args:
-        data: triangles of W and y.
+        data: R factors of [W y].
         std: (g,) standard deviations of the groups.
         inflation: (g,) variance inflation of each group; None: 1.
         stated: whether `std` is the noise itself; if not, only its proportions are used and the residuals give the
@@ -202,7 +202,7 @@ def _pack(
     """Return the fit with residual standard deviations and degrees of freedom, both corrected for variance inflation.
 
     Args:
-        data: triangles of W and y.
+        data: R factors of [W y].
         values, covariance: (p,) estimate and its (p, p) covariance.
         std, tau: (g,) standard deviations and variance inflation of the groups.
         inverse: (p, p) R⁻¹ of the weighted W.
@@ -238,7 +238,7 @@ def leverage(data: Triangles, std: np.ndarray, inverse: np.ndarray) -> np.ndarra
     """Return the leverage h_g = ‖W_g R⁻¹‖² / σ_g² (g,) of each group; the leverages of all groups sum to p.
 
     Args:
-        data: triangles of W and y.
+        data: R factors of [W y].
         std: (g,) standard deviations σ_g.
         inverse: (p, p) R⁻¹ of the weighted W.
     """

@@ -36,7 +36,7 @@ class Triangles:
 
     Attributes:
         names, units: names and units of the p parameters (columns of W).
-        factors: (g, p + 1, p + 1) upper triangular matrices; the last column is that of y.
+        factors: (g, p + 1, p + 1) upper triangular matrices; the last column contains y.
         rows: (g,) number of rows absorbed so far in each group.
     """
 

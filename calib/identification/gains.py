@@ -81,7 +81,7 @@ class DriveGains:
 
     @property
     def told(self) -> tuple[str, ...]:
-        """Status of each gain: ``told`` (identified), ``not told``, or ``reference`` (others are relative to it)."""
+        """Status of each gain: ``told`` (identified), ``not told``, or ``reference`` (other gains relative to it)."""
         status = []
         for joint, (gain, sigma) in enumerate(zip(self.gains, self.sigma)):
             if joint in self.own:
@@ -225,7 +225,7 @@ def identify_gains(
 
 
 def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray, reference: int) -> DriveGains:
-    """Return the gains relative to that of a reference joint; gains that the motion does not identify are set to 1.
+    """Return gains relative to the gain of a reference joint; gains that the motion does not identify are set to 1.
 
     The standard deviations are the larger of two, times `LEFT`: those from the residuals, and those of a jackknife over
     time blocks (Efron & Tibshirani 1993, eq. 11.5), which contain part of the model's errors. A gain counts as

@@ -59,9 +59,9 @@ class Identification(Generic[Model]):
     Attributes:
         dynamics: the model with its parameter values.
         base: base columns selected from the standard model, and their regrouping.
-        fitted: the estimate of base parameters and further friction.
+        fitted: the estimate of base parameters and additional friction.
         elimination: the elimination to the essential parameters; None if not requested.
-        friction: further friction terms selected on held-out time.
+        friction: additional friction terms selected on held-out time.
         settings: settings of the identification.
         rows: observation rows of the training data.
         terms: the drive term of each estimated parameter; None for parameters of bodies.
@@ -86,7 +86,7 @@ class Identification(Generic[Model]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the estimated parameters: base parameters, then further friction."""
+        """Names of the estimated parameters: base parameters, then additional friction."""
         friction_names = [term.name for term in self.friction.terms]
         return (*self.base.names, *friction_names)
 
@@ -147,7 +147,7 @@ def identify_model(
 ) -> Identification[RegressorModel]:
     """Return the identification of a model, linear in its parameters, from recordings.
 
-    The steps are base columns, prior, further friction, the method's estimate, ripple, and essential parameters. The
+    The steps are base columns, prior, additional friction, the method's estimate, ripple, and essential parameters. The
     method states which of them it supports.
 
     Args:
@@ -281,10 +281,10 @@ def _weighed_after_standstills(
 ) -> list[ObservationRows]:
     """Return the rows with lower weights after standstills, while the friction of standstill still decays.
 
-    This decay is estimated from residuals of a fit with further friction, which also explains slow motion.
+    This decay is estimated from residuals of a fit with additional friction, which also explains slow motion.
 
     Args:
-        rows: rows of all recordings, further friction included.
+        rows: rows of all recordings, additional friction included.
         cases: recordings.
         decimator: filter of the rows.
         torque_rows: kind of torques in the rows.
@@ -420,7 +420,7 @@ def _torque_limits(chain: Chain) -> np.ndarray | None:
 
 
 def _has_drives(model: RegressorModel) -> TypeGuard[IdentificationModel]:
-    """Return whether a model supports further friction terms, which act on the motors of single joints."""
+    """Return whether a model supports additional friction terms, which act on the motors of single joints."""
     return isinstance(model, IdentificationModel) and model.torque_rows.with_motors
 
 
@@ -473,7 +473,10 @@ def _richer_friction(
 def _with_ripple(
     dynamics: Dynamics[RegressorModel], cases: Sequence[Case], settings: IdentificationSettings, say: Progress
 ) -> tuple[Dynamics[RegressorModel], tuple[Ripple, ...]]:
-    """Return the model with gear ripple identified from its residuals, and this ripple, if the settings request it."""
+    """Return the model with gear ripple identified from its residuals, and the ripple of all joints.
+
+    Without a request in the settings, the model is unchanged and there is no ripple.
+    """
     model = dynamics.model
     if not _has_drives(model) or not model.torque_rows.motors_alone or settings.friction not in ("auto", "ripple"):
         return dynamics, ()
@@ -504,7 +507,7 @@ def _with_payloads(
 
 
 def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) -> Decimator:
-    """Return the common filter and decimation of all cases: that of the widest band among them.
+    """Return the filter and decimation for all cases, with the widest identification band among the cases.
 
     If this gives more than ``settings.samples`` rows, only every second, third, … row is used. The band is not reduced:
     long recordings have redundant rows, but fast motion is identified only in a wide band.

@@ -271,7 +271,7 @@ class LoopMetrics:
         failure: reason why there are no instruments; empty otherwise.
         notes: remarks on the simulated loops.
         instruments: the method that simulates.
-        beside: whether the user's estimate is that of another method.
+        beside: whether the user's estimate was made by another method.
         rounds: number of iterations until convergence.
         durbin_wu_hausman: test whether least squares is biased.
         largest_shift_sigma: largest difference of a parameter from least squares, in standard deviations.

@@ -123,7 +123,7 @@ def refuse_currents(folder: Path, task: str) -> None:
 
 
 def refuse_other_arm(folder: Path, chain: Chain) -> None:
-    """Raise an error if the identification in `folder` is that of another arm than `chain`.
+    """Raise an error if `folder` contains the identification of another arm than `chain`.
 
     Raises:
         UsageError: for another number of joints, or another position of the tip at equal joint values.

@@ -127,7 +127,7 @@ class Score:
 
     @property
     def judged(self) -> PredictionErrors:
-        """Errors that the verdict uses: those of moving joints, or all errors if no joint is at rest.
+        """Errors that the verdict uses: errors of moving joints, or all errors if no joint is at rest.
 
         Friction at rest is undetermined, so that errors at rest do not count.
         """

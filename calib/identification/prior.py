@@ -120,7 +120,7 @@ class Prior:
         deviation: (b,) prior standard deviations of δ, i.e. about the common part s u of the whole robot.
         sizes: size σ by kind of parameters, and κ under the name ``whole``.
         source: source of u, ``cad`` or ``sizes`` (rods between the joints).
-        first: the fit of the base parameters with this prior, without further friction.
+        first: the fit of the base parameters with this prior, without additional friction.
         tempering: weight of the prior for the values, relative to its weight for their covariance.
     """
 
@@ -161,7 +161,7 @@ class _Sizes:
     """Prior standard deviations of p parameters and k common directions, as functions of log sizes t.
 
     Attributes:
-        names: names of the sizes; empty for those of further friction.
+        names: names of the sizes; empty for those of additional friction.
         member: (p + k,) index of the size of each parameter and direction.
         centre, width: (sizes,) prior mean and standard deviation of t.
         lower, upper: (sizes,) bounds of t.
@@ -196,13 +196,13 @@ def find_prior(
     Args:
         model: model of the base parameters.
         base: base parameters of the model.
-        rows: rows in the base columns, followed by those of further friction.
+        rows: rows in the base columns, followed by those of additional friction.
         robot: u, the bodies' parameters up to a factor; None: unknown.
         source: source of `robot`: ``cad`` or ``sizes``.
         noise: (rows,) standard deviation of the torques up to a common factor; None: from the residuals.
-        groups: (k,) group of each column of further friction, which have one size per group; None: there are no such
+        groups: (k,) group of each column of additional friction, which have one size per group; None: there are no such
             columns.
-        start: prior with which the search starts, e.g. without further friction; None: none.
+        start: prior with which the search starts, e.g. without additional friction; None: none.
         effort: (n,) torque limits of the joints, up to a factor; None: equal limits.
         tempering: weight of the prior for the values, relative to its weight for their covariance.
     """
@@ -369,7 +369,7 @@ def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) 
 
 
 def _shared_directions(model: RegressorModel, robot: np.ndarray, effort: np.ndarray | None) -> np.ndarray:
-    """Return common directions (p, k) of the parameters: that of the robot's bodies, then those of the drives.
+    """Return common directions (p, k) of the parameters: of the robot's bodies, then of each kind of drive term.
 
     Args:
         model: model of the parameters.
@@ -399,7 +399,7 @@ def _sizes(
         data: R factors of the rows.
         columns: columns of the parameters, and of the common directions, in the basis of `data`.
         shared: (p, k) common directions.
-        groups: groups of the columns of further friction; their sizes have no names.
+        groups: groups of the columns of additional friction; their sizes have no names.
     """
     # Names of the sizes of single parameters, then of the directions; and which parameter has which.
     kinds = [f"bodies [{unit}]" for unit in model.units[: model.inertial]]

@@ -58,7 +58,7 @@ class Case:
 
     @property
     def links(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Motion q, v, a (N, n) of the links; that of the motors if joints do not deflect."""
+        """Motion q, v, a (N, n) of the links, equal to the motors' motion if joints do not deflect."""
         return self.link or (self.motion.q, self.motion.v, self.motion.a)
 
     def deflected(self, part: slice) -> dict[str, object]:

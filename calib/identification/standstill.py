@@ -346,7 +346,7 @@ def _remembered(travel: np.ndarray, fade: float) -> np.ndarray:
 
 
 def _variance_in_motion(squares: np.ndarray, friction: np.ndarray) -> float:
-    """Return the most probable variance s² of residuals whose total variance is s² plus that of friction.
+    """Return the most probable variance s² of residuals whose total variance is s² plus the variance of friction.
 
     Args:
         squares: (M,) squared residuals.
@@ -368,8 +368,8 @@ def left_out_error(
 ) -> float:
     """Return Σ (τ - τ̂)² of the rows in motion, each time block being predicted by a fit of the other blocks.
 
-    The sum is that of torques, as in the errors shown to users. If rows were weighted by their residuals, a joint whose
-    torques are fitted by wrong parameters would dominate.
+    Torque errors are not weighted, as in the errors shown to users. If rows were weighted by their residuals, a joint
+    whose torques are fitted by wrong parameters would dominate.
 
     Args:
         training: rows with the tested treatment of standstills.

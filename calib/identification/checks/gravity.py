@@ -419,7 +419,12 @@ def _gravity_factors(
 
 
 def _inertia_factor(motions: Sequence[MotionSamples], reference: np.ndarray) -> float:
-    """Return the robot's inertias over those of reference bodies (10 B,), for any gravity; NaN if not identified."""
+    """Return the ratio of the robot's inertias to reference inertias, for any gravity; NaN if not identified.
+
+    Args:
+        motions: samples of the recordings.
+        reference: (10 B,) standard parameters of the reference bodies.
+    """
     moving = []
     free = []
     torque = []

@@ -223,7 +223,7 @@ def share_of_nominal(
     gravity: Sequence[float] | None = None,
     static: bool = False,
 ) -> np.ndarray:
-    """Return recorded torques over those of the nominal masses, (n,), with the drives' torques estimated as well.
+    """Return the ratios (n,) of recorded torques to the nominal masses' torques; drives are estimated as well.
 
     τ_j is fitted by least squares with τ_nominal,j, a_j, v_j, tanh(v_j / v0) and 1 on the coarse grid; a_j is the
     column of the rotor's inertia, which would otherwise be attributed to the mass. A joint is judged only if its

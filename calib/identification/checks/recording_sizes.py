@@ -75,7 +75,7 @@ INDEPENDENT_ERRORS = 6
 
 @dataclass(frozen=True)
 class ClockRatio:
-    """Ratio of inertias to masses of the recorded robot over that of reference bodies (rods between the joints).
+    """Ratio of inertias to masses of the recorded robot, divided by the ratio of reference bodies (rods).
 
     Attributes:
         ratio: the ratio, 1 for a correct clock.
@@ -119,7 +119,12 @@ def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
 
 
 def _ratio_to(robot: np.ndarray, samples: MotionSamples) -> ClockRatio | None:
-    """Return inertias over masses, divided by that ratio of reference bodies (10 B,); None if it is not identified."""
+    """Return the robot's ratio of inertias to masses over the reference bodies' ratio; None if not identified.
+
+    Args:
+        robot: (10 B,) standard parameters of the reference bodies.
+        samples: samples of a recording.
+    """
     of_gravity = samples.at_rest
     of_motion = samples.inertial - of_gravity
     beside_motion = np.concatenate([of_gravity, samples.drives], axis=2)

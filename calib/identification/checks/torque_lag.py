@@ -143,7 +143,7 @@ class _LagRows:
 
     @classmethod
     def of(cls, columns: np.ndarray, torque: np.ndarray) -> "_LagRows":
-        """Return the rows of given columns and torques, with their products."""
+        """Return the rows for columns (n, m, p) and torques (n, S, m), with the products WᵀW, Wᵀτ and τᵀτ."""
         across = columns.transpose(0, 2, 1)
         cross = across @ torque.transpose(0, 2, 1)
         return cls(columns, torque, across @ columns, cross, np.einsum("jsm,jsm->js", torque, torque))

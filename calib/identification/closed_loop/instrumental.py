@@ -197,10 +197,10 @@ class Instrumental:
 
     @property
     def apart(self) -> np.ndarray:
-        """Distance (p,) of the constrained IV estimate from that of `by_free_instruments`, in standard deviations.
+        """Distance (p,) of the constrained IV estimate from the one of `by_free_instruments`, in sigmas.
 
-        The standard deviations are those of the unconstrained fit. The distance is zero if no constraint is binding,
-        and for didim.
+        The sigmas are the standard deviations of the unconstrained fit. The distance is zero if no constraint is
+        binding, and for didim.
         """
         constrained = self.constrained
         values = self.fit.estimate.values
@@ -241,8 +241,8 @@ def identify_instrumental(
             recording's controller has a damping ratio of 0.7.
         positive: names of base parameters that must not be negative (PC-IDIM-IV).
         constraints: constraints on the estimated base parameters; None: only those of `positive`.
-        terms: further friction terms, estimated after the base parameters; the loads on which they depend are computed
-            by least squares.
+        terms: additional friction terms, estimated after the base parameters; the loads on which they depend are
+            computed by least squares.
         limit: largest number of iterations.
 
     Raises:
@@ -320,7 +320,7 @@ def _observed_with_friction(
     decimator: Decimator,
     terms: Sequence[DriveTerm],
 ) -> tuple[list[ObservationRows], _Friction]:
-    """Return the rows of all cases, with columns of the further friction terms, and these terms with their loads.
+    """Return the rows of all cases, with columns of the additional friction terms, and these terms with their loads.
 
     The loads are computed with a least-squares estimate without these terms.
     """
@@ -376,7 +376,7 @@ class _Fixed:
         observed: measured rows of each recording.
         estimator: estimator of each iteration.
         constraints: constraints on the parameters; None without.
-        friction: further friction terms.
+        friction: additional friction terms.
     """
 
     model: IdentificationModel

@@ -107,7 +107,7 @@ def instrument(
     units: Sequence[str] | None = None,
     before: Instruments | None = None,
 ) -> Instruments:
-    """Return the R factors of [Z W y], added to those of earlier rows if `before` is given.
+    """Return the R factors of [Z W y]; `before` is updated if it is given.
 
     Args:
         instruments: Z (r, p), one column for each column of W.
@@ -306,7 +306,7 @@ def by_free_instruments(
 
 
 def _projected(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
-    """Return the R factor of P_Z [W y] from that of [Z W y].
+    """Return the R factor of P_Z [W y] from the R factor of [Z W y].
 
     Raises:
         Unidentifiable: if Z or Zᵀ W do not have full rank.

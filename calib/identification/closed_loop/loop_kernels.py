@@ -72,7 +72,7 @@ def wrench(inertia, w, v, e, a):
 
 @njit(**JOINED)
 def _body(tree, body, i, amount, rate, work):
-    """Write pose, velocity, twist and acceleration of body i into `work`, from those of its parent.
+    """Write pose, velocity, twist and acceleration of body i into `work`, computed from its parent's.
 
     `amount` and `rate` are joint position and velocity; the joint acceleration is taken as zero.
     """

@@ -132,7 +132,7 @@ def take(case: Case, part: slice) -> Case:
 
 
 def _check_reference(motion: Motion) -> None:
-    """Raise an error if a motion's reference is missing, that of another motion, in degrees, or a copy of the motion.
+    """Raise an error for a motion's reference that is missing, wrong, in degrees, or a copy of the motion.
 
     Raises:
         MeasurementError: in these cases.

@@ -94,7 +94,7 @@ class _Simulated(Method):
         Args:
             problem: data and settings.
             plain: the least-squares estimate.
-            terms: further friction terms.
+            terms: additional friction terms.
 
         Raises:
             UsageError: without a loop, or for a robot that cannot be simulated.
@@ -349,7 +349,7 @@ def disagreement(problem: IdentificationProblem, estimate: MethodEstimate, test:
 
 
 def _factors(problem: IdentificationProblem, estimate: np.ndarray, reference: np.ndarray) -> tuple[float, ...]:
-    """Return for each torque row the torques of one estimate over those of another (regression slope)."""
+    """Return for each torque row the ratio of two estimates' torques (regression slope)."""
     factors = problem.pooled.factors[:, :, :-1]
     own_values = factors @ estimate
     reference_values = factors @ reference
@@ -377,7 +377,7 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
 
     Args:
         test: result of instrumental variables.
-        beside: whether the user's estimate is that of another method.
+        beside: whether the user's estimate was made by another method.
     """
     identification = test.found
     loops = test.loops

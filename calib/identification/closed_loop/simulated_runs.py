@@ -37,7 +37,7 @@ def regular_plant(
 
     Args:
         model: model of the robot.
-        terms: further friction terms, with values of zero.
+        terms: additional friction terms, with values of zero.
         loop: loop of the first recording.
         inertia: J (n,) [kg m²]; None: kd² / (2 kp) of the loop's controller.
 

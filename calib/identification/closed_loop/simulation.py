@@ -72,7 +72,7 @@ class Plant:
 
     @property
     def inertial(self) -> int:
-        """Number of the bodies' parameters, which precede those of the drives."""
+        """Number of the bodies' parameters, which precede the drive parameters."""
         return 10 * self.bodies.count
 
     def with_parameters(self, parameters: np.ndarray) -> Plant:
@@ -290,7 +290,7 @@ def _draw(rng: np.random.Generator, sigma: np.ndarray, count: int) -> np.ndarray
 def _coloured(white: np.ndarray, step: float) -> np.ndarray:
     """Return low-passed noise x_k = p x_{k-1} + √(1 - p²) w_k with p = exp(-step), for white noise w (N, n).
 
-    Its variance is that of the white noise.
+    Its variance equals the variance of w.
     """
     if not len(white):
         return white
@@ -302,7 +302,7 @@ def _coloured(white: np.ndarray, step: float) -> np.ndarray:
 
 
 def layout_of(plant: Plant) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return the index arrays by which `loop_kernels.set_parameters` writes parameters into those of `packed`."""
+    """Return the index arrays by which `loop_kernels.set_parameters` writes into the arrays of `packed`."""
     n = plant.bodies.n
     first = plant.inertial
     orders = np.broadcast_to(plant.bodies.order, (plant.bodies.count, 10))

@@ -43,7 +43,7 @@ class LeastSquares(Method):
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return the estimate of the problem's columns, with a covariance that accounts for autocorrelated residuals.
 
-        If the method takes a prior, the prior of base parameters and the ridges of further friction are used.
+        If the method takes a prior, the prior of base parameters and the ridges of additional friction are used.
         """
         return attempted(self.name, problem, lambda: self._estimate(problem))
 
@@ -75,7 +75,7 @@ def weighed(problem: IdentificationProblem) -> tuple[np.ndarray, np.ndarray]:
 def _regularised(
     problem: IdentificationProblem, prior: Prior | None, std: np.ndarray, inflation: np.ndarray, tempering: float = 1.0
 ) -> tuple[LinearFit, np.ndarray, np.ndarray]:
-    """Return the WLS fit with a prior of the base parameters, and with ridges of further friction chosen by evidence.
+    """Return the WLS fit with a prior of the base parameters, and ridges of additional friction chosen by evidence.
 
     Args:
         problem: data and settings.

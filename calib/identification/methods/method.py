@@ -56,9 +56,9 @@ class IdentificationProblem:
         base: base parameters of the model.
         cases: recordings with their motion at the full rate.
         decimator: filter and decimation of all rows.
-        rows: observation matrix and torques of each case; p columns, base columns first, then further friction.
+        rows: observation matrix and torques of each case; p columns, base columns first, then additional friction.
         terms: (p,) drive term of each column; None for parameters of bodies.
-        groups: (p,) ridge group of each column of further friction; -1 for base columns.
+        groups: (p,) ridge group of each column of additional friction; -1 for base columns.
         noise: (rows,) standard deviation of the torques, up to a common factor; None: from their residuals.
         prior: prior of the base parameters; None without one.
         loop: the closed loop in which the recordings were made; None if not stated.
@@ -208,7 +208,7 @@ def _equivalent_triangle(estimate: Estimate) -> Triangles:
 class Method(ABC):
     """An identification method, which returns an estimate for a problem.
 
-    The flags determine which steps around a method (prior, further friction, stated noise, elimination) are made.
+    The flags determine which steps around a method (prior, additional friction, stated noise, elimination) are made.
 
     Attributes:
         name: name in options and files.
@@ -218,11 +218,11 @@ class Method(ABC):
         tunes: settings chosen beforehand, not estimated from the data; () without any.
         version: number to be raised whenever the same data give another estimate or number of iterations; results that
             studies stored before are then discarded and computed again.
-        takes_prior: whether it uses a prior, ridges of further friction, and a stated noise of the rows.
+        takes_prior: whether it uses a prior, ridges of additional friction, and a stated noise of the rows.
         needs_controller: whether it simulates the closed loop of a recording.
         takes_start: whether its estimate depends on the problem's start values.
         needs_simulation: whether it needs a model whose motion can be computed from torques.
-        takes_models: whether it supports joint torque sensors and further friction; otherwise motor torques and
+        takes_models: whether it supports joint torque sensors and additional friction; otherwise motor torques and
             standard friction only.
         takes_constraints: whether its estimate satisfies the options' [constraints].
         auto_friction: meaning of friction = "auto" for this method: auto (chosen by least squares) or standard.

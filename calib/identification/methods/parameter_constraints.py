@@ -176,7 +176,7 @@ def make_constraints(
     Args:
         settings: table [constraints] of the options.
         model, base: the model and its base parameters.
-        names: (p,) names of the columns: base columns, then further friction.
+        names: (p,) names of the columns: base columns, then additional friction.
         terms: (p,) drive term of each column; None for parameters of bodies.
 
     Raises:
@@ -284,7 +284,7 @@ def hold(
 
 
 def _binding(constraints: Constraints, solution: Constrained, free: LinearFit) -> Held:
-    """Return the constraints with those that bind at a solution; the solution's order is that of `within`."""
+    """Return the constraints, and which of them bind at a solution; the solution has the order of `within`."""
     equal = constraints.lower == constraints.upper
     low = np.flatnonzero(np.isfinite(constraints.lower) & ~equal)
     high = np.flatnonzero(np.isfinite(constraints.upper) & ~equal)

@@ -67,7 +67,7 @@ class Information(Frozen):
         return float(np.sum((scaled @ solution - target) ** 2))
 
     def distance(self, standard: np.ndarray) -> float:
-        """Return the Mahalanobis distance of standard parameters (p,) from the data's optimum, in standard deviations."""
+        """Return the Mahalanobis distance of standard parameters (p,) from the data's optimum."""
         base_values = self.transform @ standard
         residual = self.factor[:, :-1] @ base_values - self.factor[:, -1]
         square = float(residual @ residual) - self.best
@@ -96,8 +96,8 @@ def of(identification: Identification, chain: Chain) -> Information:
 def _information(identification: Identification) -> np.ndarray:
     """Return the R factor [R z] (b + 1, b + 1) of an identification's data, without prior or constraints.
 
-    Rows are weighted according to their residuals' autocorrelation. The ridges of further friction are included, since
-    these terms have no other prior.
+    Rows are weighted according to their residuals' autocorrelation. The ridges of additional friction are included,
+    since these terms have no other prior.
     """
     from calib.identification.time_folds import estimate
 
@@ -158,7 +158,7 @@ def read(folder: str | Path, model: tuple[Chain, Dynamics] | None = None) -> Inf
 
 
 def _transform(names: tuple[str, ...], groups: dict[str, dict[str, float]], standard: tuple[str, ...]) -> np.ndarray:
-    """Return the regrouping matrix T (b, p) from standard parameters; rows of further friction are unit rows."""
+    """Return the regrouping matrix T (b, p) from standard parameters; rows of additional friction are unit rows."""
     column_of = {name: column for column, name in enumerate(standard)}
     transform = np.zeros((len(names), len(standard)))
     for row, name in enumerate(names):

@@ -43,7 +43,7 @@ class _MaximumLikelihood(Method):
     """Identification by maximum likelihood with errors in variables."""
 
     def takes(self, rows: TorqueRows) -> bool:
-        """Return whether the method supports these torque rows: those of motor torques only."""
+        """Return whether the method supports these torque rows: only motor torques are supported."""
         return rows.motors_alone
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:

@@ -157,7 +157,7 @@ class _Comparison:
     def whole(self, values: np.ndarray, inertia: np.ndarray) -> np.ndarray:
         """Return the parameters (p + k,) of the simulated robot.
 
-        They are those of the problem and, if the problem has no motor torques, k parameters of the motors.
+        They are the problem's parameters and, if the problem has no motor torques, k parameters of the motors.
 
         Args:
             values: (p,) parameters of the problem.

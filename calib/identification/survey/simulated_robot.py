@@ -250,7 +250,7 @@ class BelievedRobot:
     """Robot model that is simulated with the parameters of an identification problem.
 
     Attributes:
-        model: model including the problem's further friction.
+        model: model including the problem's additional friction.
         columns: (p,) index of each of the problem's parameters among those of the simulated robot; without motor
             torques, the indices of the motors' parameters follow.
         plant: simulated robot with all parameters zero.

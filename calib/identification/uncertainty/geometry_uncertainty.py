@@ -193,7 +193,7 @@ class GeometryUncertainty(Frozen):
         elements, units: names and units of the K elements of the chain, then of the tilts of gravity about the base's x
             and y axes.
         sensitivity: (p, K + 2) dφ/dg.
-        torque: (p, p) covariance due to the torques' noise, which is that of the estimate.
+        torque: (p, p) covariance due to the torques' noise, i.e. the covariance of the estimate.
         deviations: (K + 2,) standard deviations of the geometry; NaN where unknown.
         geometry: (p, p) S Σ_geometry Sᵀ; None if the covariance of the geometry is unknown.
         felt, left: (K + 2,) rms change of the rigid torque over rows and samples per unit of each element [N m or N],
@@ -239,7 +239,7 @@ class GeometryUncertainty(Frozen):
 
     @property
     def dominated(self) -> np.ndarray:
-        """Mask (p,) of parameters for which the geometry's part of σ exceeds that of the torque noise."""
+        """Mask (p,) of parameters for which the geometry's part of σ exceeds the part of the torque noise."""
         return self.sigma_geometry > self.sigma_torque
 
 
@@ -249,7 +249,7 @@ def propagate(
     cases: Sequence[Case],
     progress: Progress | None = None,
 ) -> GeometryUncertainty:
-    """Return the contribution of the geometry's covariance to that of the identified parameters.
+    """Return the geometry's contribution to the covariance of the identified parameters.
 
     Args:
         identification: the model and its rows.

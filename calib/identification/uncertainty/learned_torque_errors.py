@@ -393,7 +393,7 @@ def _rest_floors(folds: Sequence[_HeldOut], friction: np.ndarray, weights: np.nd
 
 
 def _variance_weights(folds: Sequence[_HeldOut], run_count: int) -> np.ndarray:
-    """Return the weights κ, v, u (rows, 3) of the error variance in motion, regularised towards those of all rows.
+    """Return the weights κ, v, u (rows, 3) of the error variance in motion, regularised by all rows' errors.
 
     In units of a row's mean square error, κ and u / v are comparable between rows. A row's errors are supplemented by
     those of all other rows, which count as `BORROWED` blocks, and by two expectations: that the covariance is correct
