@@ -220,8 +220,8 @@ class IdentificationModel:
     def acting(self) -> np.ndarray:
         """Return the mask (p, rows) of regressor entries that can differ from 0.
 
-        A body's parameters affect the joints between base and body, a drive's parameters mostly its own joint only: at
-        most about half of all entries.
+        A body's parameters affect the joints between base and body; most drive parameters affect one joint. So at most
+        about half of all entries differ from 0.
         """
         if self.torque_rows.projection is not None:
             return np.ones((self.p, self.rows), dtype=bool)
@@ -297,8 +297,12 @@ class IdentificationModel:
     def energy_columns(self, q: np.ndarray, v: np.ndarray, carried: Collection[str] | None = None) -> np.ndarray:
         """Return the energy (N, p) per unit of each parameter, whose time derivative is the power; zero for friction.
 
-        The columns of bodies are those of `rigid_body.energies`; that of a motor inertia is ½ v², that of a coupled
-        motor inertia v_i v_j.
+        The energies per unit of the bodies' parameters are computed by `rigid_body.energies`. The energy per unit of a
+        motor inertia is ½ v², per unit of a coupled motor inertia v_i v_j.
+
+        Args:
+            q, v: (N, n) joint positions and velocities.
+            carried: labels of the attached payloads; None: all.
         """
         out = np.zeros((len(q), self.p))
         if self.inertial:

@@ -340,7 +340,7 @@ def _project_lanes(motion, twist, columns):
 def _load_lanes(kind, scale, amount, v, a, joint):
     """Write cosine, sine, shift, velocity and acceleration of one joint into `joint`, for up to L samples.
 
-    The number of samples is that of `amount`, `v` and `a`.
+    The arrays `amount`, `v` and `a` contain the samples.
     """
     for k in range(amount.shape[0]):
         joint[2 * L + k] = amount[k]

@@ -52,8 +52,7 @@ def fill_regressor(bodies: Bodies, q: np.ndarray, v: np.ndarray, a: np.ndarray, 
 def energies(bodies: Bodies, q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return kinetic plus potential energy (N, 10 B) per unit of each standard parameter.
 
-        ½ q̇ᵀ [Y(q, 0, q̇) - Y(q, 0, 0)] - [0, gᵀ R, gᵀ p],    R, p rotation and position of the body's frame in the
-        base
+        ½ q̇ᵀ [Y(q, 0, q̇) - Y(q, 0, 0)] - [0, gᵀ R, gᵀ p],    R, p: pose of the body's frame in the base
 
     (Gautier 1997, with the regressor Y of the torques, so that M(q) q̇ = [Y(q, 0, q̇) - Y(q, 0, 0)] chi.)
 

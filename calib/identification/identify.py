@@ -279,9 +279,9 @@ def _weighed_after_standstills(
     prior: Prior,
     column_groups: np.ndarray,
 ) -> list[ObservationRows]:
-    """Return the rows with lower weights after standstills, while the friction of standstill still decays.
+    """Return the rows with lower weights shortly after standstills, where the friction at rest still decays.
 
-    This decay is estimated from residuals of a fit with additional friction, which also explains slow motion.
+    The decay is estimated from residuals of a fit with additional friction, which also explains slow motion.
 
     Args:
         rows: rows of all recordings, additional friction included.
@@ -435,9 +435,9 @@ def _richer_friction(
     settings: IdentificationSettings,
     progress: Progress | None,
 ) -> tuple[FrictionSelection, Sequence[np.ndarray | None]]:
-    """Return the friction selected on held-out time, and for each case the transmitted torques (N, n).
+    """Return the friction terms selected on held-out time, and for each case the transmitted torques (N, n).
 
-    Load-dependent terms depend on these torques; they are None if not needed.
+    Load-dependent friction depends on the transmitted torques; these are None if no tested term needs them.
     """
     loads: list[np.ndarray | None] = [None] * len(cases)
     if not _has_drives(model):

@@ -172,7 +172,7 @@ class GainPair:
 @strict
 @dataclass(frozen=True)
 class TermTable:
-    """A torque term of the options file; `joint` from 0."""
+    """A torque term of the options file; `joint` is counted from 0."""
 
     name: Name
     shape: Annotated[str, OneOf(tuple(SHAPES))]

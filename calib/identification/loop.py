@@ -370,6 +370,6 @@ class Replay:
 
     @stored
     def feedback_over_model(self) -> float:
-        """Tracking error without over tracking error with the model as feedforward, geometric mean over the joints."""
+        """Ratio of tracking errors without and with the model as feedforward, geometric mean over the joints."""
         ratio = self.rms[FEEDBACK] / np.maximum(self.rms[IDENTIFIED], 1e-12)
         return float(np.exp(np.mean(np.log(ratio))))

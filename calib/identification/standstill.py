@@ -62,7 +62,8 @@ MIN_MOVING = 10  # rows in motion, below which a joint's standing rows count as 
 def standing_joints(case: Case, v0: np.ndarray) -> np.ndarray:
     """Return the mask (N, n) of joints at rest.
 
-    A joint is at rest if it is slower than the width of Coulomb's sign for at least `MIN_STANDSTILL`.
+    A joint is at rest if it is slower than the width of Coulomb's sign for at least `MIN_STANDSTILL`, and slower than
+    `MAX_MEDIAN` times this width for half of that time.
 
     Args:
         case: the recording.
@@ -270,7 +271,7 @@ def with_breakaway(
     torque_rows: TorqueRows,
     values: np.ndarray,
 ) -> list[ObservationRows]:
-    """Return the rows with lower weights after standstills, while the friction of standstill decays.
+    """Return the rows with lower weights shortly after standstills, where the friction at rest still decays.
 
     The travel δ of this decay is estimated from residuals, as the module's docstring explains.
 

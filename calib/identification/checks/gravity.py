@@ -59,10 +59,6 @@ DIRECTIONS = 60
 """Directions of a half sphere that are tried first: some 20 degrees apart."""
 
 
-# residual with another hypothesis over that with gravity as stated, from which on it is reported; 0.95 and more on the
-# real recordings at hand (our choice)
-
-
 @dataclass(frozen=True, eq=False)
 class GravityHypotheses:
     """Gravity as identified from the torques of recorded motions, compared with the stated vector.
@@ -89,7 +85,7 @@ class GravityHypotheses:
 
     @property
     def factor(self) -> float:
-        """Rms residual with the other direction over that with the stated one, geometric mean over the joints."""
+        """Ratio of rms residuals with the other and with the stated direction, geometric mean over the joints."""
         ratio = self.after / self.before
         return float(np.exp(np.mean(np.log(ratio))))
 
@@ -186,8 +182,8 @@ def _without_gravity(
 class _GravitySums:
     """Regressor products WᵀW of each joint, summed over motions.
 
-    The columns of W are those of bodies in motion without gravity, of bodies at rest under gravity along x, y and z, of
-    the drives, and the torque.
+    The columns of W describe bodies in motion without gravity, bodies at rest under gravity along x, y and z, and
+    drives; the last column is the torque.
     """
 
     def __init__(self, motions: Sequence[MotionSamples]) -> None:
@@ -233,7 +229,7 @@ class _GravitySums:
         return squares
 
     def _under(self, gravity: np.ndarray) -> np.ndarray:
-        """Return the matrix (k, p + 1) that combines all k columns into those of bodies under a gravity vector (3,)."""
+        """Return the matrix (k, p + 1) that combines the k columns into the columns under a gravity vector (3,)."""
         inertial = np.eye(10 * self.bodies)
         by_body = inertial.reshape(self.bodies, 10, -1)
         masses = by_body[:, MASSES].reshape(4 * self.bodies, -1)
@@ -269,7 +265,8 @@ def _products(motion: MotionSamples) -> np.ndarray:
 def _columns(motion: MotionSamples) -> np.ndarray:
     """Return the columns (m, n, 10 B + 3 · 4 B + 4 n + 1) of m samples of n joints.
 
-    They are those of bodies without gravity, of bodies at rest under gravity along x, y, z, of drives, and the torque.
+    They describe bodies in motion without gravity, bodies at rest under gravity along x, y and z, and drives; the last
+    column is the torque.
     """
     m, n = motion.q.shape
     zero = np.zeros_like(motion.v)

@@ -279,9 +279,9 @@ def _changed(samples: MotionSamples, matrix: np.ndarray) -> MotionSamples:
 def _unexplained_by_masses(samples: MotionSamples, masses: np.ndarray) -> np.ndarray:
     """Return the share (n,) of each joint's torque variance that the robot's masses do not explain.
 
-    Each torque is modelled by the gravity torque and the torque of motion of the robot's masses, with one factor each,
-    by the joint's drive and by those of the neighbouring joints: wrists are coupled by their gears, and this could be
-    mistaken for an exchange.
+    Each torque is modelled by four parts: a factor times the gravity torque of the robot's masses, a factor times their
+    torque of motion, the drive of the joint, and the drives of the neighbouring joints. The last part is needed because
+    wrists are coupled by their gears, which could be mistaken for an exchange of joints.
 
     Args:
         samples: samples of a recording.

@@ -43,10 +43,6 @@ MASS = 9
 FIRST_MOMENT = slice(6, 9)
 
 
-# rms residual with the load over that with other gains of the joints' torques: 0.59 to 0.88 for real loads of a UR10e
-# (16 pairs of recordings), 0.99 and more where one recording's torques were scaled instead
-
-
 @dataclass(frozen=True)
 class UnstatedLoad:
     """A load that explains a recording's torques.

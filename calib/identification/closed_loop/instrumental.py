@@ -341,7 +341,7 @@ def _observed_with_friction(
 
 @dataclass(frozen=True, eq=False)
 class _Friction:
-    """Further friction terms of a model, which may depend on the joints' loads.
+    """Additional friction terms of a model, which may depend on the joints' loads.
 
     Attributes:
         terms: drive terms.

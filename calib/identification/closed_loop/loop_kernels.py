@@ -13,15 +13,15 @@ of arrays passed between functions would take half of the time. For B bodies, n 
 
     tree    (B, 3) integers: parent (B for the base), kind, coordinate
     body    (B + 1, 23): placement (rotation by rows, origin) with each joint about or along z, ten standard parameters
-    in such a frame, scale; row B, columns 0 to 2: minus the gravity vector
+            in such a frame, scale; row B, columns 0 to 2: minus the gravity vector
     linear  (n, 2 n + 1): added inertia (n columns), viscous friction (n), offset
     kinds   (T, 2): torque row and shape code of each act
     acts    (T, 8 + n): parameter value, up to seven settings, weights of the joints' motions
-    memory  (T, 2), for friction with hysteresis: state of the stop operator, and the position at which it had this
-        state
+    memory  (T, 2), for friction with hysteresis: state of the stop operator, and the position at which it had
+            this state
     loads   (n,) torques that the gears transmitted at the last call, for load-dependent friction
-    work    (B + 1, 46), first columns: pose 0, velocity 12, acceleration 18, twist 24, force 30, inertia about the
-    origin 36
+    work    (B + 1, 46), first columns: pose 0, velocity 12, acceleration 18, twist 24, force 30, inertia about
+            the origin 36
 """
 
 from math import cos, sin, sqrt
@@ -377,7 +377,7 @@ def set_parameters(values, order, entries, shares, owners, body, linear, acts):
 def forward_dynamics(tree, body, linear, kinds, acts, order, entries, shares, owners, values, q, v, tau, out):
     """Write accelerations to `out` (N, n); return the first sample whose accelerations cannot be computed, or -1.
 
-    values (N, p): parameters of each sample; if its shape is (0, p), those in body, linear and acts are used.
+    values (N, p): parameters of each sample. If its shape is (0, p), the parameters in body, linear and acts are used.
     """
     n, count = q.shape[1], kinds.shape[0]
     work, matrix = np.empty((tree.shape[0] + 1, 46)), np.empty((n, n))
@@ -493,7 +493,8 @@ def advance_points(tree, body, linear, kinds, acts, order, entries, shares, owne
 def command(gains, aim, speed, seen, rate, integral, period, wish):
     """Write the controller's feedback command (n,) into `wish`, from reference and measurement.
 
-    aim, speed: reference position and velocity; seen, rate: measured ones; rows of `gains` as in `closed_loop`.
+    aim, speed: reference position and velocity. seen, rate: measured position and velocity. The rows of `gains` are
+    explained in `closed_loop`.
     """
     for j in range(wish.shape[0]):
         error = aim[j] - seen[j]

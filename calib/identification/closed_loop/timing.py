@@ -240,9 +240,9 @@ def check_no_copy(motion: Motion, reference_q: np.ndarray) -> None:
 
 
 def _noise_shares(motion: Motion, measured: np.ndarray, residual: np.ndarray, joints: np.ndarray) -> np.ndarray:
-    """Return the noise power in `residual` over that in the `measured` positions, joint by joint.
+    """Return the ratio of the noise powers in `residual` and in the `measured` positions, joint by joint.
 
-    Both powers are those in the lowest octave below the positions' cut-off in which the spectrum of the positions is at
+    Both powers are taken in the lowest octave below the positions' cut-off in which the spectrum of the positions is at
     its noise floor. Joints without such an octave are omitted.
 
     Args:

@@ -91,7 +91,7 @@ def driving(dynamics: Dynamics, cases: Sequence[Case]) -> np.ndarray:
 
 
 def driven(dynamics: Dynamics, cases: Sequence[Case]) -> tuple[int, ...]:
-    """Return the joints, from 0, whose friction adds energy: their torques are reversed, or those of another joint.
+    """Return the joints, from 0, whose friction adds energy: their torques are reversed or exchanged between joints.
 
     Raises:
         MeasurementError: if the friction of most of the moving joints adds energy.

@@ -55,8 +55,8 @@ class Definite:
 def contradicting(matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[int, ...]:
     """Return the indices of rows of lower <= A b <= upper that contradict each other; empty if all can be satisfied.
 
-    A linear program minimises the sum of violations. The contradicting rows are those with a non-zero multiplier
-    (Farkas' certificate).
+    A linear program minimises the sum of violations. Rows with a non-zero multiplier contradict each other (Farkas'
+    certificate).
 
     Args:
         matrix: A (c, p).

@@ -132,8 +132,8 @@ class _OutputError(Method):
 class _Comparison:
     """Comparison of simulated with recorded signals of all closed loops.
 
-    Residuals and Jacobians have r columns: those of the torque sensors, if the problem has any, then n of positions or
-    motor torques.
+    Residuals and Jacobians have r columns: first the torque sensors, if the problem has any, then n positions or motor
+    torques.
 
     Attributes:
         problem: data and settings.

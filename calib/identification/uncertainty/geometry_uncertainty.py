@@ -523,8 +523,8 @@ def compare(
 ) -> GeometryComparison:
     """Return a comparison of the estimate with one from the same torques on the nominal geometry.
 
-    Both geometries are used in weighted least squares with equal weights. The difference of the two results is added to
-    the identification's estimate, which gives that on the nominal geometry.
+    Weighted least squares with equal weights is solved on both geometries. The estimate on the nominal geometry is the
+    identification's estimate plus the difference of these two solutions.
 
     Args:
         identification: the model and its rows.

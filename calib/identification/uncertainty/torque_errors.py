@@ -184,7 +184,8 @@ class TorqueDiscrepancy:
     def distance(self, q: np.ndarray, v: np.ndarray, a: np.ndarray, rows: int) -> np.ndarray:
         """Return log(1 + d²) (N, rows), with d the distance of states q, v, a (N, n) from the training range.
 
-        d is the distance of the row's joint; for rows that are not those of single joints, of all joints together.
+        d is the distance of the row's joint. For rows of other torques than those of single joints, d is the distance
+        of all joints together.
         """
         scaled = self._excess(q, v, a) / np.array(self.scale)[:, None]
         square = np.sum(scaled**2, axis=0)
