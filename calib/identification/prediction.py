@@ -174,8 +174,8 @@ def score(
     Args:
         case: the recording.
         predicted: (N, rows) torques.
-        slow: speed [rad/s or m/s] below which a joint counts as at rest, one for all or one per joint; None: the
-            default of `calib.data.signals.motion.moving`.
+        slow: share of a joint's peak speed below which the joint counts as at rest, or one speed per joint [rad/s or
+            m/s]; None: the default of `calib.data.signals.motion.moving`.
         apart: rows in a different unit, excluded from totals.
     """
     motion = case.motion
