@@ -176,9 +176,9 @@ def _tables(arm_type: ArmType) -> list[Block]:
     parameters = [
         RecordColumn("parameter", "{0.name}", number=False),
         RecordColumn("arms", "{0.arms}"),
-        RecordColumn("mean", lambda row: small(row.mean, row.unit, 3)),
-        RecordColumn("sigma", lambda row: small(row.sigma, row.unit, 3)),
-        RecordColumn("width", lambda row: small(row.width, row.unit, 3)),
+        RecordColumn("mean", _mean),
+        RecordColumn("sigma", _sigma),
+        RecordColumn("width", _width),
     ]
     tool_columns = [
         RecordColumn("tool", "{0.tool}", number=False),
@@ -201,6 +201,18 @@ def _tables(arm_type: ArmType) -> list[Block]:
         table(f"Tools of {arm_type.name}", tool_columns, compared),
         table(f"Parameters of {arm_type.name}", parameters, arm_type.parameters, note),
     ]
+
+
+def _mean(row: ParameterSpread) -> str:
+    return small(row.mean, row.unit, 3)
+
+
+def _sigma(row: ParameterSpread) -> str:
+    return small(row.sigma, row.unit, 3)
+
+
+def _width(row: ParameterSpread) -> str:
+    return small(row.width, row.unit, 3)
 
 
 def _arm_count(row: ToolUse) -> str:

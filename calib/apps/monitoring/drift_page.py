@@ -66,11 +66,11 @@ class DriftFound(ChartedResult, ReportedResult):
             RecordColumn("poses", "{0.poses}"),
             RecordColumn("visits", "{0.x.size}"),
             RecordColumn("slope", _rate),
-            RecordColumn("x mm", lambda trend: f"{1e3 * trend.slope[0]:+.2g}"),
-            RecordColumn("y mm", lambda trend: f"{1e3 * trend.slope[1]:+.2g}"),
-            RecordColumn("z mm", lambda trend: f"{1e3 * trend.slope[2]:+.2g}"),
-            RecordColumn("in all mm", lambda trend: f"{1e3 * trend.total:.3g}"),
-            RecordColumn("σ", lambda trend: f"{trend.sigmas:.1f}"),
+            RecordColumn("x mm", _slope_x_mm),
+            RecordColumn("y mm", _slope_y_mm),
+            RecordColumn("z mm", _slope_z_mm),
+            RecordColumn("in all mm", _total_mm),
+            RecordColumn("σ", "{0.sigmas:.1f}"),
         ]
         blocks = [Text("Notes", notes_of(self.noticed), "note"), table("Drift of the target", columns, self.trends)]
         return Section("Drift", blocks, self.verdict.level, self.verdict.reason)
@@ -121,6 +121,22 @@ class DriftFound(ChartedResult, ReportedResult):
 
 def _rate(trend: Trend) -> str:
     return f"{1e3 * trend.size:.2g} ± {1e3 * trend.sigma:.1g} mm/{trend.unit}"
+
+
+def _slope_x_mm(trend: Trend) -> str:
+    return f"{1e3 * trend.slope[0]:+.2g}"
+
+
+def _slope_y_mm(trend: Trend) -> str:
+    return f"{1e3 * trend.slope[1]:+.2g}"
+
+
+def _slope_z_mm(trend: Trend) -> str:
+    return f"{1e3 * trend.slope[2]:+.2g}"
+
+
+def _total_mm(trend: Trend) -> str:
+    return f"{1e3 * trend.total:.3g}"
 
 
 def drift(
