@@ -71,7 +71,8 @@ from calib.robot.formats.urdf_write import add_joint, centred, numbers_text, put
 from calib.robot.kinematics import joint_frames
 from calib.transforms import invert
 
-PLATFORM, CLOSURES = "platform", "robot.yaml"
+PLATFORM = "platform"
+CLOSURES = "robot.yaml"
 USES = {
     URDF: "for ROS, MoveIt, Pinocchio: the robot cut open at its platform",
     CLOSURES: "for Pinocchio: the frames of robot.urdf that close the loops, the actuated joints, joint values at home",
@@ -376,7 +377,9 @@ def _calibrated(robot: ParallelMechanism, folder: Path) -> _Source:
     prior_bodies = next(find_prior_bodies(chain, arm))
     estimate = read_estimate(folder)
     _, covariance = read_covariance(folder / COVARIANCE)
-    names, units, values = [], [], []
+    names = []
+    units = []
+    values = []
     for row in estimate:
         names.append(row.name)
         units.append(row.unit)

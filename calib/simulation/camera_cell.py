@@ -124,7 +124,8 @@ def camera_cell(
         facing_up = Rotation.from_euler("x", np.pi)
         table = np.array([0.55 * reach, 0.0, 0.0])
         station = invert(pose(facing_up, table) @ from_middle)
-        station_name, tool_name = "board", "camera"
+        station_name = "board"
+        tool_name = "camera"
         camera_turn = Rotation.from_euler("xyz", [0.05, -0.1, 0.6])
         tool = pose(camera_turn, [0.04, 0.02, 0.06])
     else:
@@ -132,7 +133,8 @@ def camera_cell(
         eye = reach * np.array([1.2, -0.15, 0.65])
         target = reach * np.array([0.35, 0.0, 0.35])
         station = invert(_looking(eye, target))
-        station_name, tool_name = "camera", "board"
+        station_name = "camera"
+        tool_name = "board"
         board_turn = Rotation.from_euler("xyz", [0.1, 0.15, 0.3])
         tool = pose(board_turn, [0.02, 0.03, 0.05]) @ from_middle
     optics = Optics((lens,), ("camera",), (shape or BoardShape(),), ("board",))
@@ -186,7 +188,8 @@ def views(
     min_distance, max_distance = sought.distance
     if camera.mounting != IN_HAND:
         # a camera beside the arm stands farther away
-        min_distance, max_distance = 2.0 * min_distance, 3.0 * max_distance
+        min_distance = 2.0 * min_distance
+        max_distance = 3.0 * max_distance
     min_corners = MIN_CORNERS
     if sought.whole:
         min_corners = len(corners(camera.board))
@@ -209,7 +212,8 @@ def visible(camera: CameraCell, q: np.ndarray) -> np.ndarray:
     poses = board_poses(camera, q)
     points = _points(camera, poses)
     in_sight = camera.lens.in_sight(points.reshape(-1, 3), 6.0)
-    normals, positions = poses[:, :3, 2], poses[:, :3, 3]
+    normals = poses[:, :3, 2]
+    positions = poses[:, :3, 3]
     facing = np.einsum("mi,mi->m", normals, positions) > 0.0
     return in_sight.reshape(points.shape[:2]) & facing[:, None]
 

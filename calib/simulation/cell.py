@@ -200,11 +200,15 @@ def write_measured(measured: Positions, path: str | Path, degrees: bool = True) 
         path: path of the file.
         degrees: False for SI units throughout.
     """
-    angle, length = 1.0, 1.0
-    angle_unit, length_unit = "rad", "m"
+    angle = 1.0
+    length = 1.0
+    angle_unit = "rad"
+    length_unit = "m"
     if degrees:
-        angle, length = 180.0 / np.pi, 1e3
-        angle_unit, length_unit = "deg", "mm"
+        angle = 180.0 / np.pi
+        length = 1e3
+        angle_unit = "deg"
+        length_unit = "mm"
     header = [f"{name} [{angle_unit}]" for name in measured.joint_names]
     header += [f"{axis} [{length_unit}]" for axis in "xyz"]
     columns = [angle * measured.q, length * measured.position]
@@ -226,9 +230,11 @@ def write_log(recording: Recording, path: str | Path, degrees: bool = True) -> P
 
     Seven digits, as controllers log.
     """
-    angle, angle_unit = 1.0, "rad"
+    angle = 1.0
+    angle_unit = "rad"
     if degrees:
-        angle, angle_unit = 180.0 / np.pi, "deg"
+        angle = 180.0 / np.pi
+        angle_unit = "deg"
     series = [("q", angle * recording.q, angle_unit), ("tau", recording.effort, "Nm")]
     if recording.tau_link is not None:
         series.append(("tau_link", recording.tau_link, "Nm"))

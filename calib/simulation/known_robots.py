@@ -35,7 +35,8 @@ def _fourier(
     harmonics = np.arange(1, sines.shape[1] + 1)
     speed = base * harmonics
     phase = np.outer(t, speed)
-    sin, cos = np.sin(phase), np.cos(phase)
+    sin = np.sin(phase)
+    cos = np.cos(phase)
     q = np.asarray(centre) + sin @ sines.T + cos @ cosines.T
     v = (cos * speed) @ sines.T - (sin * speed) @ cosines.T
     a = -(sin * speed**2) @ sines.T - (cos * speed**2) @ cosines.T
@@ -73,7 +74,8 @@ def random_fourier(
     _project_out(cosines, order**2)
     base = 2 * np.pi / duration
     raw = _fourier(np.zeros(n), sines, cosines, base, duration, rate)
-    low, high = raw.q.min(axis=0), raw.q.max(axis=0)
+    low = raw.q.min(axis=0)
+    high = raw.q.max(axis=0)
     # how far each joint may be scaled up before it meets each of its limits
     travel_share = (upper - lower) / (high - low)
     velocity_share = velocity / np.abs(raw.v).max(axis=0)
@@ -107,7 +109,9 @@ def trapezoidal(
     velocity = np.broadcast_to(np.asarray(velocity, dtype=float), n)
     acceleration = np.broadcast_to(np.asarray(acceleration, dtype=float), n)
     still = np.zeros((round(pause * rate), n))
-    positions, velocities, accelerations = [still + points[0]], [still], [still]
+    positions = [still + points[0]]
+    velocities = [still]
+    accelerations = [still]
     for start, stop in pairwise(points):
         q, v, a = _move(start, stop, velocity, acceleration, rate)
         positions += [q, still + stop]

@@ -18,7 +18,9 @@ COLUMNS = ("alpha", "d", "theta", "r")
 NOMINAL_ERRORS = {"position_mm": {"max": 9.6806, "mean": 5.9019}, "orientation_deg": {"max": 0.8058, "mean": 0.5636}}
 CALIBRATED_ERRORS = {"position_mm": {"max": 1.7592, "mean": 0.7965}, "orientation_deg": {"max": 0.2268, "mean": 0.1042}}
 TABLE_3 = {"nominal": NOMINAL_ERRORS, "calibrated": CALIBRATED_ERRORS}
-POSES, BASE_PARAMETERS, CONDITION = 17, 32, 11.1878
+POSES = 17
+BASE_PARAMETERS = 32
+CONDITION = 11.1878
 # frames moved by joints 2 to 7, whose rows of Table 2 the library's arm has
 ARM_FRAMES = range(2, 8)
 # of the paper's Table 1: joint limits [rad]

@@ -147,7 +147,8 @@ def _on_sheet(
     direction = rays(lens, grid.reshape(-1, 2))
     ray = np.column_stack([direction, np.ones(len(direction))])
     # where they meet the sheet; a bent one is met by iteration
-    turn, position = pose[:3, :3], pose[:3, 3]
+    turn = pose[:3, :3]
+    position = pose[:3, 3]
     normal = pose[:3, 2]
     hit = np.zeros((len(ray), 2))
     for _ in range(BENT_ITERATIONS if shape.bent else 1):

@@ -26,7 +26,8 @@ from calib.transforms import to_quaternion
 # number of poses over the whole joint range
 TRUTH = 2000
 # of the validation motion [s], [Hz]
-SECONDS, RATE = 20.0, 250.0
+SECONDS = 20.0
+RATE = 250.0
 # of joints without a stated limit [rad/s or m/s]
 DEFAULT_SPEED = 2.0
 
@@ -170,7 +171,8 @@ def _true_parameters(arm: MovingArm, running: float) -> dict[str, float]:
     warming = arm.unmodelled.warming * (1.0 - np.exp(-running / WARM_TIME))
     for number in range(1, arm.chain.n + 1):
         for name, change in (("Fv", 0.0), ("Fc", arm.unmodelled.memory)):
-            link, motor = f"{name}l{number}", f"{name}m{number}"
+            link = f"{name}l{number}"
+            motor = f"{name}m{number}"
             parameters[motor] += (change - warming) * (parameters[link] + parameters[motor])
         # of whole drives, for models that do not separate motor and link
         for name in ("Fv", "Fc", "off"):

@@ -27,7 +27,8 @@ from calib.robot.chain import Chain, random_joints
 from calib.robot.kinematics import gravity_torques
 
 # i_0 [poses], t_0 [s]
-WARM_POSES, WARM_TIME = 30.0, 120.0
+WARM_POSES = 30.0
+WARM_TIME = 120.0
 # s_k [rad or m]
 WIDTHS = (2e-3, 8e-3, 30e-3)
 # N

@@ -28,13 +28,19 @@ from calib.simulation.cell import Cell
 from calib.simulation.unmodelled import TorqueErrors, gear_torques
 
 # how wrong the maker's masses are, 1 sigma: shape, centre [m], mass
-STRETCH, SHIFT, MASS = 0.05, 6e-3, 0.04
+STRETCH = 0.05
+SHIFT = 6e-3
+MASS = 0.04
 # of the joint controller [Hz], [-], and of its measured speed's filter [Hz]
-BANDWIDTH, DAMPING, CUTOFF = 8.0, 0.8, 60.0
+BANDWIDTH = 8.0
+DAMPING = 0.8
+CUTOFF = 60.0
 # share of the friction that the controller feeds forward
 KNOWN = 0.8
 # noise of the encoders [rad]; of the torques as logged, as a share of their limits (our choice)
-SIGMA_Q, SIGMA_LINK, SIGMA_MOTOR = 1e-5, 0.003, 0.005
+SIGMA_Q = 1e-5
+SIGMA_LINK = 0.003
+SIGMA_MOTOR = 0.005
 # at rest before and after a motion [s]
 REST = 1.0
 # our choice
@@ -42,7 +48,8 @@ UNMODELLED = TorqueErrors(memory=0.3, warming=0.1, ripple=0.005, cable=0.0005, p
 # [Hz]
 PUSH_BAND = 20.0
 # of joints without a stated limit: speed [rad/s or m/s] and torque [N m or N]
-DEFAULT_SPEED, DEFAULT_EFFORT = 2.0, 100.0
+DEFAULT_SPEED = 2.0
+DEFAULT_EFFORT = 100.0
 
 
 @dataclass(frozen=True, eq=False)

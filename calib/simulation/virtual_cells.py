@@ -20,9 +20,13 @@ ORDERS = (2, 3)
 CMM = SimulatedInstrument()
 NO_ERRORS = PositionErrors()
 # how far a made-up arm is from its nominal (1 sigma) [m], [rad], [rad]
-LENGTH, ANGLE, OFFSET = 0.3e-3, 0.5e-3, 3e-3
+LENGTH = 0.3e-3
+ANGLE = 0.5e-3
+OFFSET = 3e-3
 # hidden part of the LWR4+ [rad/(N m)], [rad]
-COMPLIANCE, AMPLITUDE, HIDDEN_SEED = 2e-5, 6e-4, 2
+COMPLIANCE = 2e-5
+AMPLITUDE = 6e-4
+HIDDEN_SEED = 2
 # share of it where `UNMODELLED` comes on top
 MODELLED = 0.7
 # our choice
@@ -40,7 +44,8 @@ def deflection(chain: Chain, compliance: np.ndarray, amplitude: np.ndarray, seed
     """
     rng = np.random.default_rng(seed)
     phases = rng.uniform(0.0, 2.0 * np.pi, (chain.n, len(ORDERS)))
-    terms, values = [], []
+    terms = []
+    values = []
     for j, element_index in enumerate(chain.moving):
         name = chain.elements[element_index].name
         terms.append(Term(name, "torque", j))

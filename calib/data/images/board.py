@@ -94,10 +94,12 @@ class Board:
 def corners(board: Board) -> np.ndarray:
     """Return the positions (K, 3) [m] of a board's corners in the board's frame."""
     if board.kind == "apriltag":
-        pitch, side = board.square + board.marker, board.square
+        pitch = board.square + board.marker
+        side = board.square
         positions = []
         for row, column in product(range(board.rows), range(board.columns)):
-            x, y = column * pitch, row * pitch
+            x = column * pitch
+            y = row * pitch
             for shift_x, shift_y in ((0.0, 0.0), (side, 0.0), (side, side), (0.0, side)):
                 positions.append((x + shift_x, y + shift_y, 0.0))
         return np.array(positions)

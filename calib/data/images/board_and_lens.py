@@ -40,7 +40,9 @@ BENT = 0.5
 # reprojection error of no lens [px]
 WRONG = 50.0
 # images that a lens needs; that a first lens is found from; that starts are tried on (our choice)
-MIN_IMAGES, MAX_IMAGES, MAX_TRIED = 4, 30, 8
+MIN_IMAGES = 4
+MAX_IMAGES = 30
+MAX_TRIED = 8
 # relative sigma of the focal length above which images do not tell it (our choice)
 MAX_FOCAL_SIGMA = 0.01
 # of the fit of a lens
@@ -87,7 +89,8 @@ def _from_homography(table: np.ndarray, sight: np.ndarray) -> np.ndarray:
     visible = np.flatnonzero(~np.isnan(sight[:, 0]))
     if len(visible) < MIN_SEEN:
         return pose(None, [0.0, 0.0, 1.0])
-    ray, points = sight[visible], table[visible, :2]
+    ray = sight[visible]
+    points = table[visible, :2]
     middle = points.mean(axis=0)
     size = points.std() + 1e-9
     flat = np.column_stack([(points - middle) / size, np.ones(len(visible))])
@@ -245,13 +248,15 @@ def _fitted(board: Board, pixel: np.ndarray, size: tuple[int, int], model: str) 
     cost = _squares(rows)
     damping = 1e-3
     for _ in range(LENS_STEPS):
-        matrix, residual = rows[:, :FITTED], rows[:, FITTED]
+        matrix = rows[:, :FITTED]
+        residual = rows[:, FITTED]
         length = np.linalg.norm(matrix, axis=0) + 1e-300
         padded = np.concatenate([matrix / length, np.sqrt(damping) * np.eye(FITTED)])
         target = np.append(residual, np.zeros(FITTED))
         solution, *_ = np.linalg.lstsq(padded, target, rcond=None)
         step = np.append(solution / length, fixed)
-        trial_lens, trial_rows = lens, rows
+        trial_lens = lens
+        trial_rows = rows
         # not with a focal length below zero
         with suppress(CalibError):
             trial_lens = lens.with_values(lens.values + step)
@@ -259,7 +264,9 @@ def _fitted(board: Board, pixel: np.ndarray, size: tuple[int, int], model: str) 
         trial_cost = _squares(trial_rows)
         if trial_cost < cost:
             settled = cost - trial_cost < 1e-6 * cost
-            lens, rows, cost = trial_lens, trial_rows, trial_cost
+            lens = trial_lens
+            rows = trial_rows
+            cost = trial_cost
             damping = damping / 10.0
             if settled:
                 break

@@ -149,7 +149,8 @@ def pdf(board: Board, size: tuple[float, float]) -> bytes:
         f"<< /Length {len(content)} >>\nstream\n".encode() + content + b"\nendstream",
         b"<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica /Encoding /WinAnsiEncoding >>",
     ]
-    result, offsets = b"%PDF-1.4\n", []
+    result = b"%PDF-1.4\n"
+    offsets = []
     for number, object_bytes in enumerate(objects, 1):
         offsets.append(len(result))
         result += f"{number} 0 obj\n".encode() + object_bytes + b"\nendobj\n"
@@ -161,10 +162,12 @@ def pdf(board: Board, size: tuple[float, float]) -> bytes:
 
 def _page(board: Board, size: tuple[float, float]) -> tuple[np.ndarray, list[tuple[float, float, str]]]:
     """Return the black rectangles (N, 4) [m] and the texts of a page: board in the middle, ruler below."""
-    left_edge, top = 0.5 * (size[0] - board.extent[0]), 0.5 * (size[1] - RULER - board.extent[1])
+    left_edge = 0.5 * (size[0] - board.extent[0])
+    top = 0.5 * (size[1] - RULER - board.extent[1])
     boxes = _black(board) + np.array([left_edge, top, 0.0, 0.0])
     length = 0.01 * int(100 * min(board.extent[0], 0.2) + 1e-9)
-    base, line_width = size[1] - EDGE - 0.006, 0.0002
+    base = size[1] - EDGE - 0.006
+    line_width = 0.0002
     ticks = [[left_edge - line_width / 2, base, length + line_width, line_width]]
     for millimetre in range(round(1e3 * length) + 1):
         tick_height = 0.002
@@ -246,7 +249,8 @@ def make(
 def _as_printed(out: Path) -> bool:
     """Return whether a folder's ``board.toml`` is unchanged since `make` wrote it with ``board.svg``."""
     try:
-        board, drawn = read_board(out), (out / "board.svg").read_bytes()
+        board = read_board(out)
+        drawn = (out / "board.svg").read_bytes()
         sizes = []
         for paper in ("", *PAPERS):
             with suppress(UsageError):  # a paper that it does not fit onto

@@ -68,7 +68,8 @@ def detect(image: np.ndarray, board: Board, thorough: bool = True) -> Detection:
         reason = f"only {len(ids)} of {len(table)} corners are sharp enough: blurred, or too small"
         return Detection(no_pixels, no_sigmas, problem=reason)
     sigma, edge, motion = _quality(image, pixels, FLOOR[board.kind], spacing)
-    pixel, sigmas = no_pixels, no_sigmas
+    pixel = no_pixels
+    sigmas = no_sigmas
     pixel[ids] = pixels
     sigmas[ids] = sigma
     problem = ""
@@ -86,7 +87,8 @@ def _coarse(image: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray]:
     """Return the numbers (n,) and pixels (n, 2) of the detected corners, before refinement."""
     nothing = np.zeros(0, dtype=int), np.zeros((0, 2))
     if board.kind == "chessboard":
-        columns, rows = board.columns - 1, board.rows - 1
+        columns = board.columns - 1
+        rows = board.rows - 1
         success, pixels = cv2.findChessboardCornersSB(image, (columns, rows), flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
         if not success:
             return nothing
@@ -104,7 +106,8 @@ def _coarse(image: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray]:
     tag_pixels, tags, _ = detector.detectMarkers(image)
     if tags is None:
         return nothing
-    ids, pixels = [], []
+    ids = []
+    pixels = []
     for tag, corners_of_tag in zip(tags.ravel().tolist(), tag_pixels):
         if tag < board.tags:
             ids.append(4 * tag + np.arange(4))
@@ -159,7 +162,8 @@ def _refined(
     half = int(np.clip(free * spacing, 2, 12))
     largest = np.array(image.shape[::-1]) - half - 3
     interior = ((pixels > half + 2) & (pixels < largest)).all(axis=1)
-    ids, pixels = ids[interior], pixels[interior]
+    ids = ids[interior]
+    pixels = pixels[interior]
     if not len(ids):
         return ids, pixels
     start = pixels.astype(np.float32).reshape(-1, 1, 2)

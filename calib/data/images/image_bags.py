@@ -127,7 +127,8 @@ def _grey(message: Any) -> np.ndarray:
         raise ValueError(f"images of encoding '{message.encoding}'; known are {', '.join(ENCODINGS)}")
     kind, depth = ENCODINGS[message.encoding]
     order = ">" if message.is_bigendian else "<"
-    height, width = message.height, message.width
+    height = message.height
+    width = message.width
     rows = np.frombuffer(bytes(message.data), np.uint8).reshape(height, message.step)
     # rows may be padded
     flat = np.ascontiguousarray(rows[:, : width * depth * np.dtype(kind).itemsize])

@@ -183,7 +183,8 @@ def problem_words(problems: Mapping[str, str]) -> list[str]:
     for reason, names in reasons.items():
         numbers = [MEASURED.findall(problems[name]) for name in names]
         for numerals in zip(*numbers):
-            low, high = min(numerals, key=float), max(numerals, key=float)
+            low = min(numerals, key=float)
+            high = max(numerals, key=float)
             number_range = low if low == high else f"{low} to {high}"
             reason = reason.replace("#", number_range, 1)
         images = "images are" if len(names) > 1 else "image is"

@@ -99,7 +99,8 @@ class Lens:
     def project_with_slopes(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return pixels (N, 2), ∂pixel/∂point (N, 2, 3) [px/m] and ∂pixel/∂values (N, 2, k) for points (N, 3) [m]."""
         depth = points[:, 2]
-        focal, centre = self.values[:2], self.values[2:4]
+        focal = self.values[:2]
+        centre = self.values[2:4]
         plane = points[:, :2] / depth[:, None]
         bent, across, by_value = BEND[self.model](plane, self.values[4:])
         by_point = np.empty((len(points), 2, 3))
@@ -115,7 +116,8 @@ class Lens:
 
 def _brown_conrady(plane: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return distorted coordinates (N, 2) and their Jacobians with respect to `plane` (N, 2, 2) and k (N, 2, K)."""
-    a, b = plane[:, 0], plane[:, 1]
+    a = plane[:, 0]
+    b = plane[:, 1]
     square = a * a + b * b
     k1, k2, p1, p2, k3 = k[:5]
     k4, k5, k6 = k[5:] if len(k) > 5 else (0.0, 0.0, 0.0)

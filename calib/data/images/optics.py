@@ -106,7 +106,8 @@ class Optics:
         """Return the optics with other parameter values; each focal length is limited to a change by half of its
         present value.
         """
-        lenses, start = [], 0
+        lenses = []
+        start = 0
         for lens in self.lenses:
             lens_values = np.array(values[start : start + len(lens.values)])
             lens_values[:2] = np.clip(lens_values[:2], 0.5 * lens.values[:2], 1.5 * lens.values[:2])

@@ -154,7 +154,8 @@ def read_corners(path: Path, board: Board) -> Found:
         for heading, cell in row.items():
             key = (heading or "").split("[")[0].strip()
             cells[key] = (cell or "").strip()
-        name, problem = cells.get("image", ""), cells.get("problem", "")
+        name = cells.get("image", "")
+        problem = cells.get("problem", "")
         with refused_as(
             MeasurementError, (KeyError, ValueError, OverflowError), "expected image, corner, u, v ({})", path, number
         ):
@@ -162,7 +163,8 @@ def read_corners(path: Path, board: Board) -> Found:
                 size = int(float(cells["u"])), int(float(cells["v"]))
                 continue
             if name not in images:
-                no_pixels, no_sigmas = np.full((count, 2), np.nan), np.full(count, np.nan)
+                no_pixels = np.full((count, 2), np.nan)
+                no_sigmas = np.full(count, np.nan)
                 edge = float(cells.get("edge") or "nan")
                 images[name] = Detection(no_pixels, no_sigmas, problem, edge)
             if problem or not cells.get("corner"):

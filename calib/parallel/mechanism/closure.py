@@ -309,7 +309,8 @@ def _check_postures(mechanism: ClosedRobot, posture: Posture) -> None:
         weak = _leg_rcond(link, home_link) < SINGULAR
         _refuse(mechanism, posture, weak, f"{leg.name} is singular (type 1: stretched or folded)")
         _refuse(mechanism, posture, other_branch[:, k], f"{leg.name} is on another branch than at home")
-    rows, home_rows = _reading_rows(mechanism, links), _reading_rows(mechanism, home)
+    rows = _reading_rows(mechanism, links)
+    home_rows = _reading_rows(mechanism, home)
     weak = _platform_rcond(mechanism, rows, home_rows) < SINGULAR
     _refuse(mechanism, posture, weak, "the platform is singular (type 2: locked actuators do not hold it)")
     _refuse(mechanism, posture, other_branch[:, -1], "the platform is beyond a type 2 singularity from home")
@@ -386,11 +387,14 @@ def _tell_unreached(mechanism: ClosedRobot, posture: Posture, unreached: np.ndar
     """Raise NoPosture for samples whose loops Newton's method does not close, with the likely reason."""
     first = posture[unreached[:1]]
     home = leg_links(mechanism.robot, mechanism.home)
-    largest_gap, farthest_leg, weak_leg = -np.inf, "", ""
+    largest_gap = -np.inf
+    farthest_leg = ""
+    weak_leg = ""
     for leg, link, home_link in zip(mechanism.robot.legs, leg_links(mechanism.robot, first), home):
         gap = float(np.abs(link.gap).max())
         if gap > largest_gap:
-            largest_gap, farthest_leg = gap, leg.name
+            largest_gap = gap
+            farthest_leg = leg.name
         if not weak_leg and float(_leg_rcond(link, home_link)[0]) < WEAK:
             weak_leg = leg.name
     gap_mm = 1e3 * largest_gap
@@ -454,7 +458,8 @@ def _platform_rcond(mechanism: ClosedRobot, rows: np.ndarray, home: np.ndarray) 
     """Return reciprocal conditions (N,) of J_p^inv; translations and rotations are scaled by their maxima at home."""
     turns = mechanism.robot.selected > 2
     size = np.linalg.norm(home[0], axis=0)
-    turn_size, shift_size = size[turns].max(initial=0.0), size[~turns].max(initial=0.0)
+    turn_size = size[turns].max(initial=0.0)
+    shift_size = size[~turns].max(initial=0.0)
     scale = np.where(turns, turn_size, shift_size)
     row_size = np.linalg.norm(home[0] / scale, axis=1)
     scaled = rows / scale / row_size[:, None]

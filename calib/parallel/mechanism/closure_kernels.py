@@ -11,7 +11,9 @@ from numba import njit
 
 from calib.dynamics.kernels import OPTIONS
 
-KIND, SCALE, REVOLUTE = 1, 12, 1
+KIND = 1
+SCALE = 12
+REVOLUTE = 1
 
 
 @njit(**OPTIONS)
@@ -54,7 +56,9 @@ def one_leg(links, constants, tail, attachment, held, q, pose, full, inverse, ca
             frame (4, 6 + 3 n) to work in, or wider.
     """
     n = q.shape[0]
-    r, o, place = frame[:3, :3], frame[3, :3], frame[:3, 3:6]
+    r = frame[:3, :3]
+    o = frame[3, :3]
+    place = frame[:3, 3:6]
     for i in range(3):
         o[i] = 0.0
         for k in range(3):
@@ -71,28 +75,37 @@ def one_leg(links, constants, tail, attachment, held, q, pose, full, inverse, ca
         for i in range(3):
             frame[i, 6 + j] = o[i]
         if links[j, KIND] == REVOLUTE:
-            cosine, sine = np.cos(amount), np.sin(amount)
+            cosine = np.cos(amount)
+            sine = np.sin(amount)
             for i in range(3):
                 r[i, 0] = cosine * place[i, 0] + sine * place[i, 1]
                 r[i, 1] = cosine * place[i, 1] - sine * place[i, 0]
                 r[i, 2] = place[i, 2]
-                full[i, j], full[3 + i, j] = 0.0, constants[j, SCALE] * place[i, 2]
+                full[i, j] = 0.0
+                full[3 + i, j] = constants[j, SCALE] * place[i, 2]
         else:
             for i in range(3):
                 for k in range(3):
                     r[i, k] = place[i, k]
                 o[i] += amount * place[i, 2]
-                full[i, j], full[3 + i, j] = constants[j, SCALE] * place[i, 2], 0.0
+                full[i, j] = constants[j, SCALE] * place[i, 2]
+                full[3 + i, j] = 0.0
     for i in range(3):
         lever[i] = pose[i, 0] * attachment[0, 3] + pose[i, 1] * attachment[1, 3] + pose[i, 2] * attachment[2, 3]
         o[i] += r[i, 0] * tail[0, 3] + r[i, 1] * tail[1, 3] + r[i, 2] * tail[2, 3]
         gap[i] = o[i] - pose[i, 3] - lever[i]
         carried[i, i] = 1.0
-    carried[0, 4], carried[1, 5], carried[2, 3] = lever[2], lever[0], lever[1]
-    carried[0, 5], carried[1, 3], carried[2, 4] = -lever[1], -lever[2], -lever[0]
+    carried[0, 4] = lever[2]
+    carried[1, 5] = lever[0]
+    carried[2, 3] = lever[1]
+    carried[0, 5] = -lever[1]
+    carried[1, 3] = -lever[2]
+    carried[2, 4] = -lever[0]
     for j in range(n):
         if links[j, KIND] == REVOLUTE:
-            x, y, z = o[0] - frame[0, 6 + j], o[1] - frame[1, 6 + j], o[2] - frame[2, 6 + j]
+            x = o[0] - frame[0, 6 + j]
+            y = o[1] - frame[1, 6 + j]
+            z = o[2] - frame[2, 6 + j]
             full[0, j] = full[4, j] * z - full[5, j] * y
             full[1, j] = full[5, j] * x - full[3, j] * z
             full[2, j] = full[3, j] * y - full[4, j] * x
@@ -108,7 +121,8 @@ def one_leg(links, constants, tail, attachment, held, q, pose, full, inverse, ca
                 for m in range(3):
                     r[i, k] += pose[i, m] * attachment[m, k]
         for i in range(3):
-            a, b = (i + 1) % 3, (i + 2) % 3
+            a = (i + 1) % 3
+            b = (i + 2) % 3
             total = 0.0
             for m in range(3):
                 total += place[b, m] * r[a, m] - place[a, m] * r[b, m]

@@ -282,7 +282,9 @@ class ParallelModel:
         J = motion.jacobians
         out = np.zeros((self._bodies + len(self.terms), robot.r, len(motion.v)))
         for bodies, joints, columns in self.legs:
-            q, v, a = motion.posture.q[:, joints], motion.v[:, joints], motion.a[:, joints]
+            q = motion.posture.q[:, joints]
+            v = motion.v[:, joints]
+            a = motion.a[:, joints]
             W = rigid_body.regressor(bodies, q, v, a)
             W = W[:, :, : columns.stop - columns.start]
             out[columns] = np.einsum("njr,njc->crn", J.joints[:, joints], W, optimize=True)

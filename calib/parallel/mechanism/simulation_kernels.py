@@ -35,7 +35,8 @@ def _add(A, x, out):
 @njit(**OPTIONS)
 def _platform(body, pose, turn, gravity, M, h):
     """Write the platform's inertia M (6, 6), zero on entry, and its wrench h (6,) where the twist does not change."""
-    w, g = (turn[0], turn[1], turn[2]), (gravity[0], gravity[1], gravity[2])
+    w = (turn[0], turn[1], turn[2])
+    g = (gravity[0], gravity[1], gravity[2])
     rows = (three(pose, 0, 0), three(pose, 1, 0), three(pose, 2, 0))
     moments = body[6], body[7], body[8]
     S = dot(rows[0], moments), dot(rows[1], moments), dot(rows[2], moments)
@@ -57,7 +58,8 @@ def _platform(body, pose, turn, gravity, M, h):
 @njit(**OPTIONS)
 def _bent(full, v, turn, lever, leg, shift):
     """Add to row `leg` of `shift` (L, 6) that of a leg's acceleration equations J q̈ = G ṫ - shift, see `velocities`."""
-    w, t = (0.0, 0.0, 0.0), (turn[0], turn[1], turn[2])
+    w = (0.0, 0.0, 0.0)
+    t = (turn[0], turn[1], turn[2])
     for j in range(v.shape[0]):
         moved = scaled(v[j], (full[0, j], full[1, j], full[2, j]))
         turned = scaled(v[j], (full[3, j], full[4, j], full[5, j]))
@@ -74,7 +76,8 @@ def _freedoms(full, inverse, carried, held, starts, selected, D, back):
     The legs' equations J q̇ = G t - e leave (1 - J J⁺) (G t - e) = 0; of it the twist's other parts by least squares,
     the selected ones of t_0 being zero (`calib.parallel.mechanism.closure.twists`).
     """
-    L, r = starts.shape[0] - 1, selected.shape[0]
+    L = starts.shape[0] - 1
+    r = selected.shape[0]
     others = np.empty(6 - r, np.int64)
     count = 0
     for i in range(6):
@@ -84,10 +87,13 @@ def _freedoms(full, inverse, carried, held, starts, selected, D, back):
         if free:
             others[count] = i
             count += 1
-    square, mixed = np.zeros((6 - r, 6 - r)), np.zeros((6 - r, r))
-    rows, across = np.zeros((L, 6, 6)), np.zeros((L, 6, 6))
+    square = np.zeros((6 - r, 6 - r))
+    mixed = np.zeros((6 - r, r))
+    rows = np.zeros((L, 6, 6))
+    across = np.zeros((L, 6, 6))
     for leg in range(L):
-        n, c = starts[leg + 1] - starts[leg], held[leg]
+        n = starts[leg + 1] - starts[leg]
+        c = held[leg]
         for i in range(c):
             across[leg, i, i] = 1.0
             for m in range(c):
@@ -141,12 +147,20 @@ def _leg_share(links, constants, parameters, drives, held, inverse, carried, shi
     Args:
         drives: (n, 5); q, rates, tau: (n,); J: (n, r) of its joints.
     """
-    n, r = q.shape[0], h.shape[0]
+    n = q.shape[0]
+    r = h.shape[0]
     rows = np.zeros((6, n + 1, n))  # of the motion, and of the same with one joint accelerating by one more
-    amount, cosine, sine, v, a, need = rows[0], rows[1], rows[2], rows[3], rows[4], rows[5]
+    amount = rows[0]
+    cosine = rows[1]
+    sine = rows[2]
+    v = rows[3]
+    a = rows[4]
+    need = rows[5]
     for j in range(n):
-        amount[:, j], v[:, j] = constants[j, SCALE] * q[j], rates[j]
-        cosine[:, j], sine[:, j] = np.cos(amount[0, j]), np.sin(amount[0, j])
+        amount[:, j] = constants[j, SCALE] * q[j]
+        v[:, j] = rates[j]
+        cosine[:, j] = np.cos(amount[0, j])
+        sine[:, j] = np.sin(amount[0, j])
         for m in range(held):
             bent = -shift[m]
             for b in range(6):
@@ -182,12 +196,27 @@ def _accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
     """
     links, constants, tails, attachments, starts, held, selected, actuated, gravity, fixed = robot
     parameters, body, drives = values
-    r, n_t, L, most = rate.shape[0], q.shape[0], starts.shape[0] - 1, links.shape[1]
-    full, inverse, carried = np.zeros((L, 6, most)), np.zeros((L, most, 6)), np.zeros((L, 6, 6))
-    gap, lever, shift, back = np.zeros((L, 6)), np.zeros((L, 3)), np.zeros((L, 6)), np.zeros((L, 6, 6))
-    frame, D, J = np.zeros((4, 6 + 3 * most)), np.zeros((6, r)), np.zeros((n_t, r))
-    M, whole = np.zeros((r, r)), np.zeros((6, 6))
-    mend, still, wrench, h, torque = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(r), np.zeros(n_t)
+    r = rate.shape[0]
+    n_t = q.shape[0]
+    L = starts.shape[0] - 1
+    most = links.shape[1]
+    full = np.zeros((L, 6, most))
+    inverse = np.zeros((L, most, 6))
+    carried = np.zeros((L, 6, 6))
+    gap = np.zeros((L, 6))
+    lever = np.zeros((L, 3))
+    shift = np.zeros((L, 6))
+    back = np.zeros((L, 6, 6))
+    frame = np.zeros((4, 6 + 3 * most))
+    D = np.zeros((6, r))
+    J = np.zeros((n_t, r))
+    M = np.zeros((r, r))
+    whole = np.zeros((6, 6))
+    mend = np.zeros(6)
+    still = np.zeros(6)
+    wrench = np.zeros(6)
+    h = np.zeros(r)
+    torque = np.zeros(n_t)
     for leg in range(L):
         one_leg(
             links[leg],
@@ -220,13 +249,15 @@ def _accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
     for j in range(actuated.shape[0]):
         torque[actuated[j]] = tau[j]
     for leg in range(L):
-        first, last = starts[leg], starts[leg + 1]
+        first = starts[leg]
+        last = starts[leg + 1]
         _follow(held[leg], inverse[leg], carried[leg], gap[leg], mend, D, q[first:last], J[first:last])
         _add(J[first:last], rate, rates[first:last])
         _bent(full[leg], rates[first:last], twist[3:], lever, leg, shift)
         _add(back[leg], shift[leg], still)
     for leg in range(L):
-        first, last = starts[leg], starts[leg + 1]
+        first = starts[leg]
+        last = starts[leg + 1]
         _leg_share(
             links[leg],
             constants[leg],
@@ -274,13 +305,19 @@ def _accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
 @njit(**OPTIONS)
 def _turn(factor, twist, pose, out):
     """Write a pose moved by `factor` times a twist (6,): p += v, R = Exp(ω) R (Rodrigues); `out` may be `pose`."""
-    x, y, z = factor * twist[3], factor * twist[4], factor * twist[5]
+    x = factor * twist[3]
+    y = factor * twist[4]
+    z = factor * twist[5]
     angle = np.sqrt(x * x + y * y + z * z)
     one = np.sin(angle) / angle if angle > 1e-12 else 1.0
     two = 0.5 * (np.sin(0.5 * angle) / (0.5 * angle)) ** 2 if angle > 1e-12 else 0.5
     for k in range(3):
-        a, b, c = pose[0, k], pose[1, k], pose[2, k]
-        dx, dy, dz = y * c - z * b, z * a - x * c, x * b - y * a
+        a = pose[0, k]
+        b = pose[1, k]
+        c = pose[2, k]
+        dx = y * c - z * b
+        dy = z * a - x * c
+        dz = x * b - y * a
         out[0, k] = a + one * dx + two * (y * dz - z * dy)
         out[1, k] = b + one * dy + two * (z * dx - x * dz)
         out[2, k] = c + one * dz + two * (x * dy - y * dx)
@@ -300,11 +337,22 @@ def run(robot, values, q, pose, rate, mixing, gains, reference, encoder, period,
         far: distance from the reference [rad or m] at which a run has diverged.
         out: (3, N, n) true and measured positions, torque held from instant to instant.
     """
-    actuated, n, r = robot[7], robot[7].shape[0], rate.shape[0]
-    q2, pose2, rate2 = q.copy(), pose.copy(), rate.copy()
-    rates, change, twist = np.zeros(q.shape[0]), np.zeros(r), np.zeros(6)
-    speed, read, before, integral = reference[1, 0].copy(), np.zeros(n), np.zeros(n), np.zeros(n)
-    wish, tau, waiting = np.zeros(n), np.zeros(n), np.zeros((late + 1, n))
+    actuated = robot[7]
+    n = robot[7].shape[0]
+    r = rate.shape[0]
+    q2 = q.copy()
+    pose2 = pose.copy()
+    rate2 = rate.copy()
+    rates = np.zeros(q.shape[0])
+    change = np.zeros(r)
+    twist = np.zeros(6)
+    speed = reference[1, 0].copy()
+    read = np.zeros(n)
+    before = np.zeros(n)
+    integral = np.zeros(n)
+    wish = np.zeros(n)
+    tau = np.zeros(n)
+    waiting = np.zeros((late + 1, n))
     for k in range(reference.shape[1]):
         for j in range(n):
             read[j] = q2[actuated[j]] + encoder[k, j]
@@ -323,8 +371,11 @@ def run(robot, values, q, pose, rate, mixing, gains, reference, encoder, period,
                 integral[j] -= period * (reference[0, k, j] - read[j])  # no winding up against the limit
             waiting[k % (late + 1), j] = held
             tau[j] = waiting[(k + 1) % (late + 1) if k >= late else 0, j]
-            out[0, k, j], out[1, k, j], out[2, k, j] = q2[actuated[j]], read[j], tau[j]
-        left, span = period, 0.0
+            out[0, k, j] = q2[actuated[j]]
+            out[1, k, j] = read[j]
+            out[2, k, j] = tau[j]
+        left = period
+        span = 0.0
         while left > 1e-9 * period:
             for half in range(2):  # one call, which the compiler joins into this loop: two take it twice as long
                 decay = _accelerate(robot, values, q2, pose2, rate2, tau, rates, twist, change)
@@ -335,7 +386,9 @@ def run(robot, values, q, pose, rate, mixing, gains, reference, encoder, period,
                     if pieces * period > 2 * MAX_STEPS * left:
                         return STIFF, k
                     span = left / pieces
-                    q[:], pose[:], rate[:] = q2, pose2, rate2
+                    q[:] = q2
+                    pose[:] = pose2
+                    rate[:] = rate2
                 length = span if half else 0.5 * span
                 for i in range(q.shape[0]):
                     q2[i] = q[i] + length * rates[i]
