@@ -31,7 +31,7 @@ from calib.robot.kinematics import gravity_torques
 from calib.simulation.unmodelled import PositionErrors, displacements, drooping
 from calib.transforms import invert, pose
 
-# pose lists that a session plans, and the names of their measurements
+# Names of the pose lists that a session plans, each with the name under which its measurement is stored.
 PLANS = (("poses", "measured"), ("validation_poses", "validation_measured"))
 
 
@@ -112,12 +112,15 @@ def measure(
         warm: number of poses to which the arm has moved before; infinite for a warm arm.
 
     Returns:
-        Poses (or positions), with the sigmas that the instrument's maker states, drift and outliers not included.
+        Poses, or positions if the instrument measures points only, with the sigmas that the instrument's maker states.
+        These sigmas do not include drift and outliers.
     """
     rng = np.random.default_rng(seed)
     instrument = cell.instrument
-    measured = _noisy(true_poses(cell, q, warm=warm), instrument, rng)
-    sigma, sigma_rotation = _stated(instrument, np.zeros((len(q), 3)))
+    true = true_poses(cell, q, warm=warm)
+    measured = _noisy(true, instrument, rng)
+    no_lever = np.zeros((len(q), 3))
+    sigma, sigma_rotation = _stated(instrument, no_lever)
     if instrument.base_frame is not None:
         base = cell.truth.stations[0] @ instrument.base_frame
         base_poses = np.broadcast_to(base, measured.shape)
