@@ -1,9 +1,10 @@
-"""Compiled kernels (numba) of closed loops: the legs at given postures.
+"""Compiled kernels (numba) of closed loops: Jacobians and gaps of the legs at given postures.
 
-A leg is read from the arrays of its `Bodies`, ``links`` and ``constants``, every frame turned so that its joint's axis
-is z; ``tail`` (4, 4) takes its last frame to its end. The platform is at ``pose`` (4, 4); c of a leg's six equations
-are held. Loops over elements instead of array expressions: numba takes several times as long to compile the latter, and
-every array has one kind (C order, of the widest leg), so that each kernel is compiled once.
+A leg is given by the arrays ``links`` and ``constants`` of its `Bodies`, whose frames are turned so that the joint's
+axis is z; ``tail`` (4, 4) is the pose of the leg's end in its last frame. ``pose`` (4, 4) is the platform's pose; c of
+a leg's six closure equations are used. The kernels loop over elements, because numba takes several times as long to
+compile array expressions. All arrays have one memory layout (C order, size of the largest leg), so that each kernel is
+compiled once.
 """
 
 import numpy as np
@@ -11,14 +12,19 @@ from numba import njit
 
 from calib.dynamics.kernels import OPTIONS
 
+# Column of `links` with the kind of the joint, and the kind of revolute joints.
 KIND = 1
-SCALE = 12
 REVOLUTE = 1
+# Column of `constants` with the factor on the joint's value.
+SCALE = 12
 
 
 @njit(**OPTIONS)
 def invert(A, out):
-    """Write A⁻¹ (n, n) by Gauss and Jordan with row pivots, overwriting A; a zero pivot is made tiny."""
+    """Write A⁻¹ (n, n) into `out` by Gauss–Jordan elimination with row pivots; A is overwritten.
+
+    A zero pivot is replaced by a tiny one, so that the inverse of a singular matrix has huge entries.
+    """
     n = A.shape[0]
     for i in range(n):
         for j in range(n):
@@ -48,12 +54,17 @@ def invert(A, out):
 
 @njit(**OPTIONS)
 def one_leg(links, constants, tail, attachment, held, q, pose, full, inverse, carried, gap, lever, frame):
-    """Write one leg at one posture; see `calib.parallel.mechanism.closure.LegLinks`.
+    """Write Jacobians and gap of one leg at one posture; see `calib.parallel.mechanism.closure.LegLinks`.
+
+    All arrays may be larger than stated.
 
     Args:
-        held: c.
-        full: (6, n), inverse (n, c), carried (c, 6), zero on entry, gap (c,), lever (3,), or wider;
-            frame (4, 6 + 3 n) to work in, or wider.
+        links, constants, tail, attachment: arrays of the leg, see the module.
+        held: number c of closure equations.
+        q: (n,) joint values.
+        pose: (4, 4) pose of the platform.
+        full, inverse, carried, gap, lever: (6, n), (n, c), (c, 6), (c,), (3,) results; `carried` is zero on entry.
+        frame: (4, 6 + 3 n) memory for intermediate results.
     """
     n = q.shape[0]
     r = frame[:3, :3]
@@ -112,7 +123,8 @@ def one_leg(links, constants, tail, attachment, held, q, pose, full, inverse, ca
     if held == 6:
         for i in range(3):
             carried[3 + i, 3 + i] = 1.0
-        for i in range(3):  # orientations: ends in `place`, attachment in `r`, then the skew part of end · attachmentᵀ
+        # orientations: the end's in `place`, the attachment's in `r`; the gap is the skew part of end · attachmentᵀ
+        for i in range(3):
             for k in range(3):
                 place[i, k] = r[i, 0] * tail[0, k] + r[i, 1] * tail[1, k] + r[i, 2] * tail[2, k]
         for i in range(3):
@@ -149,7 +161,7 @@ def one_leg(links, constants, tail, attachment, held, q, pose, full, inverse, ca
 
 @njit(**OPTIONS)
 def legs(links, constants, tail, attachment, q, pose, full, inverse, carried, gap, lever):
-    """Write one leg at N postures: q (N, n), pose (N, 4, 4); arrays as in `one_leg`, with a leading axis N."""
+    """Write Jacobians and gap of one leg at N postures; arrays as in `one_leg`, with a leading axis of length N."""
     frame = np.empty((4, 6 + 3 * q.shape[1]))
     for s in range(q.shape[0]):
         one_leg(

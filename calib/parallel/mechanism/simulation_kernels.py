@@ -1,6 +1,7 @@
-"""Compiled closed loop (numba): a parallel robot under a sampled controller of its actuators, midpoint rule in between.
+"""Compiled simulation (numba) of a parallel robot under a sampled controller of its actuators.
 
-The platform's coordinates are integrated, the legs follow, their gaps closed on the way; notation of `closure_kernels`.
+Between samples the platform's coordinates are integrated by the midpoint rule. The legs' joints follow the platform,
+and each evaluation also corrects the gaps of the loops. Notation as in `closure_kernels`.
 """
 
 from __future__ import annotations
@@ -57,7 +58,10 @@ def _platform(body, pose, turn, gravity, M, h):
 
 @njit(**OPTIONS)
 def _bent(full, v, turn, lever, leg, shift):
-    """Add to row `leg` of `shift` (L, 6) that of a leg's acceleration equations J q̈ = G ṫ - shift, see `velocities`."""
+    """Add the right-hand side of a leg's acceleration equations J q̈ = G ṫ - shift to row `leg` of `shift` (L, 6).
+
+    The terms are those of `velocities.of_platform`.
+    """
     w = (0.0, 0.0, 0.0)
     t = (turn[0], turn[1], turn[2])
     for j in range(v.shape[0]):
@@ -71,10 +75,11 @@ def _bent(full, v, turn, lever, leg, shift):
 
 @njit(**OPTIONS)
 def _freedoms(full, inverse, carried, held, starts, selected, D, back):
-    """Write D (6, r), the twists that all legs can follow, and `back` (L, 6, 6), t_0 = Σ_k back[k] e_k; zero on entry.
+    """Write D (6, r) and `back` (L, 6, 6), both zero on entry: platform twists that all legs can follow are t_0 + D v.
 
-    The legs' equations J q̇ = G t - e leave (1 - J J⁺) (G t - e) = 0; of it the twist's other parts by least squares,
-    the selected ones of t_0 being zero (`calib.parallel.mechanism.closure.twists`).
+    t_0 = Σ_k back[k] e_k. From the equations J q̇ = G t - e of all legs remain (1 - J J⁺) (G t - e) = 0, which determine
+    the components of the twist that are not selected, by least squares; the selected components of t_0 are zero
+    (`calib.parallel.mechanism.closure.twists`).
     """
     L = starts.shape[0] - 1
     r = selected.shape[0]
@@ -128,7 +133,10 @@ def _freedoms(full, inverse, carried, held, starts, selected, D, back):
 
 @njit(**OPTIONS)
 def _follow(held, inverse, carried, gap, mend, D, q, J):
-    """Move a leg's joints q (n,) after the platform's step `mend` (6,), and write J (n, r), q̇ = J v; zero on entry."""
+    """Move a leg's joints q (n,) so that they follow the platform's step `mend` (6,), and close the leg's gap.
+
+    Also write J (n, r), zero on entry, with q̇ = J v.
+    """
     for m in range(held):
         missing = -gap[m]
         for a in range(6):
@@ -142,14 +150,17 @@ def _follow(held, inverse, carried, gap, mend, D, q, J):
 
 @njit(**OPTIONS)
 def _leg_share(links, constants, parameters, drives, held, inverse, carried, shift, still, q, rates, tau, J, M, h):
-    """Add a leg's share to the inertia M (r, r) and to the force h (r,) where the twist changes by `still`.
+    """Add a leg's share to the inertia M (r, r) and to the force h (r,), the force if ṫ = `still`.
 
     Args:
-        drives: (n, 5); q, rates, tau: (n,); J: (n, r) of its joints.
+        drives: (n, 5) drive parameters of the leg's joints.
+        q, rates, tau: (n,) joint values, rates and actuator torques of the leg.
+        J: (n, r) Jacobian of the leg's joints.
     """
     n = q.shape[0]
     r = h.shape[0]
-    rows = np.zeros((6, n + 1, n))  # of the motion, and of the same with one joint accelerating by one more
+    # Row 0 is the motion; in row j + 1 the acceleration of joint j is larger by 1.
+    rows = np.zeros((6, n + 1, n))
     amount = rows[0]
     cosine = rows[1]
     sine = rows[2]
@@ -182,17 +193,22 @@ def _leg_share(links, constants, parameters, drives, held, inverse, carried, shi
 
 @njit(**OPTIONS)
 def _accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
-    """Write v̇ (r,) into `change`, q̇ (n_t,) into `rates`, t (6,) into `twist`; close the gaps in q and pose on the way.
-
-    Returns a bound [1/s] on the fastest decay of friction near standstill, the trace of M⁻¹ Jᵀ D J with the signs'
-    steepest slopes D, or -1 where M is not positive definite.
+    """Write the accelerations of a state, and correct the gaps of the loops in q and pose.
 
     Args:
-        robot: of L legs of B bodies or fewer: links (L, B, 4 + B), constants (L, B + 1, 13), tails and attachments
-            (L, 4, 4), starts, held, selected, actuated, gravity, and whether the platform's twist is always the
-            selected parts alone.
-        values: parameters of the legs' bodies (L, 10 B), of the platform (10,), drives (n_t, 5) Ia Fv Fc off and v0.
-        q: (n_t,); pose: (4, 4) of the platform; rate: (r,); tau: (n,) of the actuators.
+        robot: arrays of L legs with at most B bodies: links (L, B, 4 + B), constants (L, B + 1, 13), tails and
+            attachments (L, 4, 4), starts, held, selected, actuated, gravity, and whether the components of the twist
+            that are not selected are always zero.
+        values: parameters of the legs' bodies (L, 10 B) and of the platform (10,), drives (n_t, 5) Ia Fv Fc off and v0.
+        q: (n_t,) values of all joints.
+        pose: (4, 4) pose of the platform.
+        rate: (r,) independent components v of the platform's twist.
+        tau: (n,) torques of the actuators.
+        rates, twist, change: results q̇ (n_t,), t (6,) and v̇ (r,).
+
+    Returns:
+        An upper bound [1/s] on the fastest decay rate of friction near standstill: the trace of M⁻¹ Jᵀ D J with the
+        steepest slopes D of the friction. -1 if M is not positive definite.
     """
     links, constants, tails, attachments, starts, held, selected, actuated, gravity, fixed = robot
     parameters, body, drives = values
@@ -304,7 +320,7 @@ def _accelerate(robot, values, q, pose, rate, tau, rates, twist, change):
 
 @njit(**OPTIONS)
 def _turn(factor, twist, pose, out):
-    """Write a pose moved by `factor` times a twist (6,): p += v, R = Exp(ω) R (Rodrigues); `out` may be `pose`."""
+    """Write a pose moved by `factor` times a twist [v; ω] (6,): p + v and Exp(ω) R (Rodrigues); `out` may be `pose`."""
     x = factor * twist[3]
     y = factor * twist[4]
     z = factor * twist[5]
@@ -326,16 +342,19 @@ def _turn(factor, twist, pose, out):
 
 @njit(**OPTIONS)
 def run(robot, values, q, pose, rate, mixing, gains, reference, encoder, period, smoothing, late, far, out):
-    """Run the loop: measure, command, hold the torque for one period, integrate. Return (status, period reached).
+    """Simulate the closed loop: in each period measure, compute the torque, hold it, integrate.
 
     Args:
         robot, values: see `_accelerate`.
         q, pose, rate: the state at the beginning, overwritten.
-        mixing: (N, n, n) that the feedback is multiplied by; none: (0, n, n).
+        mixing: (N, n, n) matrices by which the feedback is multiplied; an array (0, n, n): none.
         gains: (6, n) of the actuators' controller, reference (4, N, n): see `loop_kernels.closed_loop`.
         encoder: (N, n) noise of the readings.
         far: distance from the reference [rad or m] at which a run has diverged.
-        out: (3, N, n) true and measured positions, torque held from instant to instant.
+        out: (3, N, n) results: true positions, measured positions, torque held during each period.
+
+    Returns:
+        Status, and the number of the last simulated period.
     """
     actuated = robot[7]
     n = robot[7].shape[0]
@@ -367,8 +386,9 @@ def run(robot, values, q, pose, rate, mixing, gains, reference, encoder, period,
             for m in range(n * (mixing.shape[0] > 0)):
                 asked += mixing[k, j, m] * wish[m]
             held = min(max(asked, -gains[4, j]), gains[4, j])
+            # The integral does not grow while the torque is at its limit.
             if held != asked and (reference[0, k, j] - read[j]) * asked > 0.0:
-                integral[j] -= period * (reference[0, k, j] - read[j])  # no winding up against the limit
+                integral[j] -= period * (reference[0, k, j] - read[j])
             waiting[k % (late + 1), j] = held
             tau[j] = waiting[(k + 1) % (late + 1) if k >= late else 0, j]
             out[0, k, j] = q2[actuated[j]]
@@ -377,7 +397,8 @@ def run(robot, values, q, pose, rate, mixing, gains, reference, encoder, period,
         left = period
         span = 0.0
         while left > 1e-9 * period:
-            for half in range(2):  # one call, which the compiler joins into this loop: two take it twice as long
+            # A single call, since the compiler inlines each call and would take twice as long with two.
+            for half in range(2):
                 decay = _accelerate(robot, values, q2, pose2, rate2, tau, rates, twist, change)
                 if decay < 0.0:
                     return SINGULAR, k
