@@ -61,7 +61,7 @@ from calib.procedure.export.delivery import DRIVES, MJCF, README, TO_SIMULATE, w
 from calib.procedure.export.identified import Drives, drive_table
 from calib.procedure.findings import NOT_JUDGED
 from calib.procedure.kinematic_stage.folder import URDF
-from calib.results.registry import open_result
+from calib.results.result_classes import open_result
 from calib.robot.calibrated import ROBOT
 from calib.robot.chain import Chain, Element, Joint
 from calib.robot.formats.native import NativeModel

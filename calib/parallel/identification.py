@@ -124,7 +124,7 @@ def identify_parallel(
         on_read(inputs)
     model = model_of(mechanism, settings)
     identification: Any = identify_model(model, inputs.cases, settings, cad=model.known_parameters(), progress=progress)
-    noticed = [*_payloads(model, identification, inputs.cases)]
+    noticed = [*_payloads(model, inputs.cases)]
     if settings.identical_legs:
         noticed += legs_differ(identification, inputs.cases)
     if mechanism.robot.redundant:
@@ -318,21 +318,11 @@ def _encoders(mechanism: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding
             yield finding("passive-joints-unread", file=case.name, joints=unread_names)
 
 
-def _payloads(
-    model: ParallelModel, identification: Identification[RegressorModel], cases: Sequence[Case]
-) -> Iterator[Finding]:
-    """Yield findings on payloads that all or no recordings carry, or that are identified with a negative mass."""
-    estimate = identification.fitted.estimate
-    names = identification.base.names
+def _payloads(model: ParallelModel, cases: Sequence[Case]) -> Iterator[Finding]:
+    """Yield findings on payloads that are attached in all recordings, or in none."""
     for label in model.payloads:
         count = sum(label in case.carried for case in cases)
-        mass_name = f"M{label}"
         if count == 0:
             yield finding("payload-never", label=label)
         elif count == len(cases):
             yield finding("payload-always", label=label)
-        elif mass_name in names:
-            index = names.index(mass_name)
-            mass = estimate.values[index]
-            sigma = estimate.sigma[index]
-            yield finding("payload-absent", label=label, mass=mass, sigma=sigma, sigmas=-mass / sigma)
