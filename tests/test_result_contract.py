@@ -11,7 +11,7 @@ import pytest
 import calib
 from calib import cli
 from calib.api.rendering import Kept
-from calib.apps.fleet.report import FleetReport
+from calib.apps.fleet.fleet_report import FleetReport
 from calib.apps.monitoring.comparison.robot_change import RobotChange
 from calib.apps.monitoring.drift_page import DriftFound, drift
 from calib.apps.monitoring.log import LogLine, RobotLog
@@ -24,8 +24,8 @@ from calib.parallel.mechanism.geometric_fit import changed, loop_parameters
 from calib.parallel.robots import find
 from calib.procedure.findings import LEVELS
 from calib.result_kinds import BY_NAME, KINDS, TAKES, kind_of
-from calib.results.registry import CLASSES, open_result
 from calib.results.result import ExportSettings
+from calib.results.result_classes import CLASSES, open_result
 from calib.robot import description
 from calib.robot.library import load
 

@@ -152,7 +152,7 @@ def status(folder: Folder) -> None:
     Example: calib status cell
     """
     from calib.procedure.session import commands
-    from calib.results.registry import open_result
+    from calib.results.result_classes import open_result
 
     say(*open_result(folder, "session").status(), result=True)
     say(*commands.noted(folder))

@@ -41,7 +41,7 @@ def demo(
         payload: label=kg of a payload, with which the motions are played again; as of calib new; repeatable
     """
     from calib.apps.cell_demo import demo as demonstration
-    from calib.apps.cell_demo.summary import paths, reasons
+    from calib.apps.cell_demo.step_lines import paths, reasons
 
     with reporting() as (say, progress):
         if bring is not None:

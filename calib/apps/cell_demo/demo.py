@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.apps.cell_demo.summary import Telling, row
+from calib.apps.cell_demo.step_lines import Telling, row
 from calib.errors import SessionError, UsageError, command_line
 from calib.folders import read_estimate
 from calib.records import read_lines

@@ -19,7 +19,7 @@ import jinja2
 import numpy as np
 
 from calib import files
-from calib.apps.controller_programs.motion import is_motion, setpoints, stream_values
+from calib.apps.controller_programs.motion_streams import is_motion, setpoints, stream_values
 from calib.apps.controller_programs.program_settings import CSV, ProgramSettings
 from calib.apps.controller_programs.targets import formatted, is_program, read_program
 from calib.errors import UsageError

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from datetime import date, datetime
 from pathlib import Path
 
-from calib.apps.monitoring.comparison.calibrations import Calibration, read_fit
-from calib.apps.monitoring.comparison.places import Place, place_of
+from calib.apps.monitoring.comparison.calibration_sources import Place, place_of
+from calib.apps.monitoring.comparison.geometry_calibration import Calibration, read_fit
 from calib.errors import Finding, UsageError, finding, listing, require
 from calib.result_kinds import refusal
 from calib.toolkit.sessions import folders_of

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.apps.monitoring import pages
+from calib.apps.monitoring import report_folder
 from calib.apps.monitoring.comparison.change_part import plus_minus
 from calib.apps.monitoring.comparison.change_test import ParameterChange
 from calib.apps.monitoring.comparison.geometry_change import GeometryChange
@@ -164,11 +164,13 @@ class RobotLog(ChartedResult, ReportedResult, WithoutVerdict):
         if plots:
             charts = self.charts()
         rows = [log_line.row(self.robot) for log_line in self.lines]
-        part = pages.ResultPart(self.section(), charts, ["Errors, and motion of the tool."], (TABLE, HEADER, rows))
+        part = report_folder.ResultPart(
+            self.section(), charts, ["Errors, and motion of the tool."], (TABLE, HEADER, rows)
+        )
         lines = [dict(zip(HEADER, row)) for row in rows]
         numbers = plain({"robot": self.robot, "lines": lines})
         title = f"Calibrations of {self.robot}"
-        return pages.save(Path(out), "log", title, {"robot": self.robot}, [part], numbers, [TABLE])
+        return report_folder.save(Path(out), "log", title, {"robot": self.robot}, [part], numbers, [TABLE])
 
 
 def _nominal_error(log_line: LogLine) -> str:

@@ -160,20 +160,23 @@ def page(request: Request) -> Response:
     if session.path(RECORDING).exists():
         recording = RECORDING
     paths = _files(session)
+    tasks = [re.sub(r"^\d+ ", "", line) for line in task.splitlines()]
+    pictures = [_name(session, path) for path in paths if path.suffix in PICTURES]
+    file_names = [_name(session, path) for path in paths]
     values = {
         "session": session,
         "states": states,
         "ahead": ahead,
         "work": work,
         "to_bring": to_bring,
-        "tasks": [re.sub(r"^\d+ ", "", line) for line in task.splitlines()],
+        "tasks": tasks,
         "verdicts": verdicts,
         "kinds": _kinds(session),
         "notes": _notes(session),
         "pages": _pages(session),
         "recording": recording,
-        "pictures": [_name(session, path) for path in paths if path.suffix in PICTURES],
-        "files": [_name(session, path) for path in paths],
+        "pictures": pictures,
+        "files": file_names,
     }
     headers = {"Content-Security-Policy": POLICY, "Cache-Control": "no-store"}
     return HTMLResponse(filled(TEMPLATES, "page.html", **values), headers=headers)

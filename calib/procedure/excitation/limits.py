@@ -49,8 +49,8 @@ from calib.robot.kinematics import joint_frames, joint_jacobian, sweep
 from calib.trajectories.basis import SampledMotion
 from calib.trajectories.constraints import BoxLimit, MotionConstraint, box_limits
 from calib.trajectories.errors import NothingFeasible
-from calib.trajectories.places import Clearance, Workspace
 from calib.trajectories.setpoints import Setpoints
+from calib.trajectories.workspace_limits import Clearance, Workspace
 from calib.units import motion_units
 
 # [rad or m, s, N m or N] a number above is no limit of a joint; direct drives of fast robots reach 1300 (our choice)
@@ -78,7 +78,7 @@ STATED_IN = {
     "workspace": "[target] (height, axis_distance) and [[point]]",
     "clearance": "[collision] (margin, radius, floor) and [[obstacle]]",
 }
-# constraints of pose selection that `trajectories.places.Workspace` keeps
+# constraints of pose selection that `trajectories.workspace_limits.Workspace` keeps
 OF_WORKSPACE = ("height", "distance from the axis")
 
 

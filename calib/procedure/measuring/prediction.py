@@ -22,7 +22,7 @@ from calib.geometry.weighing import GeometricFit
 from calib.poses.design import Pool
 from calib.poses.errors import NotIdentifiable, TooFewCandidates
 from calib.poses.exchange import greedy
-from calib.poses.information import prepared
+from calib.poses.scaled_jacobians import prepared
 from calib.records import Array, read_json
 
 SUFFIX = "_prediction.json"

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from without_figures import run
 
-from calib.apps.cell_demo.summary import SECONDS, Telling
+from calib.apps.cell_demo.step_lines import SECONDS, Telling
 from calib.procedure.session import steps
 from calib.procedure.session.folder import open_session
 from calib.robot.formats import urdf

@@ -100,10 +100,10 @@ class ToolPart(ChangePart):
     def blocks(self) -> list[Block]:
         motions = [
             RecordColumn("target's motion at", "{0.where}", number=False),
-            RecordColumn("poses", lambda motion: f"{len(motion.q)}"),
+            RecordColumn("poses", _pose_count),
             RecordColumn("median mm", _median_mm),
-            RecordColumn("rms mm", lambda motion: f"{1e3 * motion.rms:.3g}"),
-            RecordColumn("σ of that mm", lambda motion: f"{1e3 * motion.expected:.2g}"),
+            RecordColumn("rms mm", _rms_mm),
+            RecordColumn("σ of that mm", _expected_mm),
             RecordColumn("worst mm", _worst_mm),
             RecordColumn("median mrad", _median_mrad),
             RecordColumn("worst mrad", _worst_mrad),
@@ -172,6 +172,18 @@ class ToolPart(ChangePart):
                 "turn_worst": float(motion.orientation.max()),
             }
         return {"motions": motions, "by_joint": dict(self.change.by_joint)}
+
+
+def _pose_count(motion: ToolMotion) -> str:
+    return f"{len(motion.q)}"
+
+
+def _rms_mm(motion: ToolMotion) -> str:
+    return f"{1e3 * motion.rms:.3g}"
+
+
+def _expected_mm(motion: ToolMotion) -> str:
+    return f"{1e3 * motion.expected:.2g}"
 
 
 def _median_mm(motion: ToolMotion) -> str:
