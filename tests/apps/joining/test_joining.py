@@ -95,7 +95,7 @@ def test_readings_5_mm_apart_are_named_and_near_ones_averaged_with_their_scatter
     rows[8][1] += 5.0
     found = calib.join(joints, write(tmp_path / "p.csv", ["Name", *POINT], rows))
     assert 4 not in found.poses and len(found.poses) == 39
-    assert any("between readings of pose P5 (rows 9, 10), which is left out" in note for note in found.notes)
+    assert any("pose P5 left out: its readings (rows 9, 10) differ by" in note for note in found.notes)
     sigma = found.table.numbers("sigma_x", "length")
     assert sigma == pytest.approx(0.02e-3 / np.sqrt(2.0), rel=0.3)
 

@@ -318,7 +318,7 @@ def test_what_thins_rows_is_said():
 def test_the_offset_is_said_with_its_time(found):
     line = next(note for note in found.notes if "minus the controller's" in note)
     first = found.clock.offset + found.clock.drift * (2.0 + OFFSET - found.clock.middle)
-    assert f" at {found.clock.middle:.2f} s of its own, {first:+.5f} s at its first row: " in line
+    assert f" at {found.clock.middle:.2f} s of the instrument's time, {first:+.5f} s at its first row; " in line
 
 
 REFUSED = {
