@@ -142,7 +142,7 @@ def make_model(chain: Chain, settings: IdentificationSettings) -> Identification
             if term.name in names:
                 label = f"{first + 1}_{second + 1}"
                 raise UsageError(
-                    f'coupling: parameter {term.name} is a joint\'s own; add another label: label = "{label}"'
+                    f'coupling: {term.name} is already a joint\'s parameter; add another label: label = "{label}"'
                 )
         terms += coupled
     for term in settings.terms:

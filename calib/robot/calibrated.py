@@ -141,7 +141,7 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
     if lever_terms:
         chain = deflection.reference
         if chain is None:
-            raise CalibError("sag terms need the chain that levers are taken from (reference)")
+            raise CalibError("sag terms need reference, the chain from which lever arms are computed")
         gravity = chain.gravity / np.linalg.norm(chain.gravity)
         # (z × u) · ĝ = (ĝ × z) · u
         gravity_cross_axis = np.cross(gravity, np.moveaxis(sweep(chain, q).directions, 1, -1))

@@ -338,7 +338,7 @@ def test_a_session_in_python_is_the_commands_session(logs, tmp_path, monkeypatch
     own, other = (tomllib.loads((tmp_path / name / "session.toml").read_text()) for name in ("script", "command"))
     assert made == Path("script") and own | {"created": ""} == other | {"created": ""}
     script, command = calib.run_sessions(["script", "command/session.toml"], plots=False)
-    assert script.state == command.state == "waits" and "Bring script/3-measured/measured.csv" in str(script)
+    assert script.state == command.state == "waits" and "Provide script/3-measured/measured.csv" in str(script)
     assert cli.run(["run", "command", "--no-plots"]) == 0
     assert "command: waits" in capsys.readouterr().out
     assert (made / "2-poses/poses.csv").read_bytes() == (tmp_path / "command/2-poses/poses.csv").read_bytes()
@@ -348,7 +348,7 @@ def test_a_session_in_python_is_the_commands_session(logs, tmp_path, monkeypatch
 
 def test_poses_chosen_without_constraints_say_what_they_keep_and_what_is_not_checked():
     chosen = calib.select_poses("ur5", 8, calib.SelectionSettings(method="detmax", candidates=200))
-    assert "kept: 1 % of each joint's range to its limits, self-collision" in str(chosen)
+    assert "respected: 1 % of each joint's range to its limits, self-collision" in str(chosen)
     assert "NOT checked: line of sight (the instrument's position is not known), walls" in str(chosen)
     found = json.loads(json.dumps(chosen.to_dict()))
     assert found["random_baseline"] < found["value"] and 0.9 < found["efficiency"] <= 1.0

@@ -370,7 +370,7 @@ def _objection(
         required = _sign_text(np.array(configuration.signs())) or "turns only"
         return f"{configuration.text} ({required}) is no posture at this pose; the arm reaches it with {alternatives}"
     if len(agreeing) > 1 and not started:
-        return f"{configuration.text} leaves {len(agreeing)} postures"
+        return f"{configuration.text} is ambiguous: {len(agreeing)} postures agree with it"
     return ""
 
 

@@ -71,7 +71,9 @@ def frames_in(program: Program, further: Mapping[str, str] | None = None) -> Pro
     """
     language = LANGUAGES.get(program.controller.language)
     if language is None:
-        raise UsageError(f"{program.path}: tool and user frames of {program.controller.title} are not read")
+        raise UsageError(
+            f"{program.path}: frames in programs of {program.controller.title} are not read; give the targets as a CSV"
+        )
     blank = language.without_comments(program.text)
     settings = tuple(language.setting(blank, program.targets[k]) for k in program.of("pose"))
     tools: dict[str, np.ndarray] = {}
@@ -82,7 +84,7 @@ def frames_in(program: Program, further: Mapping[str, str] | None = None) -> Pro
         for kind, frames in zip((tools, users), numbers):
             for name, pose in frames.items():
                 if name in kind and np.abs(kind[name] - pose).max() > 1e-9:
-                    raise UsageError(f"{file}: {name} is given twice, with other numbers")
+                    raise UsageError(f"{file}: {name} is given twice with different values; remove one")
                 kind[name] = pose
     tools |= dict.fromkeys(language.flange, np.eye(4))
     users |= language.base()

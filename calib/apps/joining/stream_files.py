@@ -36,7 +36,7 @@ MIN_ROWS = 200
 # by which a clock that was restarted goes back, at least [s]
 RESTART = 1.0
 # reasons for which rows are left out
-DAMAGED, LATE = "damaged, empty or not seen", "with a time not after the row before"
+DAMAGED, LATE = "damaged, empty or not seen", "with a time not after that of the row before"
 
 
 @dataclass(frozen=True, eq=False)

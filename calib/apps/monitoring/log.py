@@ -233,7 +233,7 @@ def log(folders: Sequence[str | Path], *, mixed: bool = False) -> RobotLog:
 def _check_same(attribute: str, names: Sequence[str], mixed: bool) -> None:
     """Raise UsageError for sessions that state several names, unless `mixed`; one that states none is accepted."""
     different = list(dict.fromkeys(name for name in names if name))
-    message = f"the sessions have different {attribute} ({', '.join(different)}); --mixed takes them for one robot"
+    message = f"the sessions have different {attribute} ({', '.join(different)}); give --mixed if they are of one robot"
     require(len(different) < 2 or mixed, message, UsageError)
 
 

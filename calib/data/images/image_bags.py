@@ -124,7 +124,7 @@ def _grey(message: Any) -> np.ndarray:
     if hasattr(message, "format"):
         return decode(bytes(message.data))
     if message.encoding not in ENCODINGS:
-        raise ValueError(f"images of encoding '{message.encoding}'; known are {', '.join(ENCODINGS)}")
+        raise ValueError(f"images of encoding '{message.encoding}'; supported are {', '.join(ENCODINGS)}")
     kind, depth = ENCODINGS[message.encoding]
     order = ">" if message.is_bigendian else "<"
     height, width = message.height, message.width

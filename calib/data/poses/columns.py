@@ -193,7 +193,7 @@ class Sheet:
         if len(candidates) == 1:
             return candidates[0]
         if candidates:
-            fault = " and ".join(candidates) + " could be it"
+            fault = " and ".join(candidates) + " could be meant"
         else:
             fault = f"missing{suggestion(name, self.table.header)}"
         self.fail(f"{fault}: {', '.join(together)} belong together; map this one in [columns], too", name)

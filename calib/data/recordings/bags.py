@@ -43,7 +43,7 @@ def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
         require(parts[series].size, f"its joint states have no {quantity}", MeasurementError, path)
     notes = []
     if skipped:
-        notes.append(f"{skipped} messages without one of the joints are not used")
+        notes.append(f"{skipped} messages that lack a joint are not used")
     if not parts["header"].any():
         notes.append("message headers have no stamps; the logging times are used, which jitter more")
     return Recording(

@@ -104,7 +104,7 @@ def _without_absent(recording: Recording) -> Recording:
     for name, quantity in quantities:
         if absent[name]:
             joints = ", ".join(recording.joint_names[j] for j in absent[name])
-            notes.append(f"{quantity} of {joints} are NaN in every row: not provided, and not used for any joint")
+            notes.append(f"{quantity} of {joints} are NaN in every row, so they are not used for any joint")
     removed = dict.fromkeys(name for name, joints in absent.items() if joints)
     return _noted(replace(recording, **removed), *notes)
 

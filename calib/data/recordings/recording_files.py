@@ -44,7 +44,7 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
     for name, columns in columns_of.items():
         if name != "t" and len(columns) != n:
             headings = ", ".join(_headings(table, columns))
-            refuse_data(path, f"{len(columns)} columns of {name} ({headings}) for {n} of q")
+            refuse_data(path, f"has {len(columns)} columns of {name} ({headings}), but {n} of q")
         check_units(name, [table.units[column] for column in columns], joints, path)
 
     t = _stamps(table, columns_of, options)

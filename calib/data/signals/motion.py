@@ -391,7 +391,7 @@ def _reasons(cutoffs: Cutoffs, options: FilterOptions) -> tuple[str, ...]:
     for name, option in (("cutoff", options.cutoff), ("band", options.band)):
         if option is not None:
             frequencies = " ".join(f"{frequency:.4g}" for frequency in np.atleast_1d(option))
-            lines.append(f"{name} = {frequencies} Hz, stated, or that of the training motion")
+            lines.append(f"{name} = {frequencies} Hz, as stated or as for the training motion")
     # Both are stated: none was chosen from the data.
     if len(lines) == 2:
         return tuple(lines)

@@ -117,7 +117,7 @@ def _with_fitted_lens(block: Pixels, fitted_blocks: Sequence[PoseMeasurements]) 
 def _lens_of(block: Pixels) -> Lens:
     """Return the lens of a block of images; raise if it is unknown."""
     if block.lens is None:
-        raise MeasurementError("the lens of these images is unknown", block.file)
+        raise MeasurementError("the lens of these images is unknown: give it (camera.yaml)", block.file)
     return block.lens
 
 

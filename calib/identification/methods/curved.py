@@ -280,7 +280,7 @@ def tangents(
         if not satisfied:
             price = min(10.0 * price, MAX_PRICE)
     heights_text = "; ".join(f"h of '{constraint.name}' = {constraint.value(b):.3g}" for constraint in curved)
-    raise NotConverged(f"the nearest found has {heights_text}", b)
+    raise NotConverged(f"the nearest estimate has {heights_text}", b)
 
 
 def _share(merit: Callable[[np.ndarray], float], b: np.ndarray, step: np.ndarray) -> float:

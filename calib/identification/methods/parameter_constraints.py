@@ -106,11 +106,11 @@ class Constraints(Frozen):
             return self._flattened(factor).touched(factor)
         if self.cone is None:
             return self
-        with _unsatisfied(f"no bodies that can exist satisfy {self}: remove bounds"):
+        with _unsatisfied(f"no physically consistent bodies satisfy {self}: remove bounds"):
             plane = self.cone.touching(factor, self.matrix, self.lower, self.upper)
         if plane is None:
             return replace(self, cone=None)
-        label = f"bodies that can exist ({', '.join(plane.bodies) or 'all'} on the border)"
+        label = f"physically consistent bodies ({', '.join(plane.bodies) or 'all'} on the border)"
         names = (*self.names, label)
         matrix = np.vstack([self.matrix, plane.normal])
         lower = np.append(self.lower, plane.bound)
@@ -139,7 +139,7 @@ class Constraints(Frozen):
             return further.solve(triangle, free)
 
         names = tuple(constraint.name for constraint in self.curved)
-        with _unsatisfied(f"no estimate satisfies {'; '.join(names)} beside {linear}: remove one of them"):
+        with _unsatisfied(f"no estimate satisfies {'; '.join(names)} together with {linear}: remove one of them"):
             normals, bounds = tangents(self.curved, factor, start, solve)
         all_names = (*self.names, *names)
         matrix = np.vstack([self.matrix, normals])

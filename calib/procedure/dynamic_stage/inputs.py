@@ -198,7 +198,7 @@ def gather(
         if shifts:
             effect = f"move the links by up to {1e3 * max(shifts):.3g} mrad or mm"
         else:
-            effect = "take no part: the links are rigid"
+            effect = "are not used: the links are rigid"
             described = described.without_corrections()
         notes.append(f"joint corrections of the geometric fit {effect}")
     return IdentificationInputs(

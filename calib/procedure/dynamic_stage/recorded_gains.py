@@ -90,8 +90,8 @@ def find_gains(
     with_gains = [path for path in motions if path not in bare_currents]
     if with_gains:
         raise UsageError(
-            f"{bare_currents[0]} holds currents without gains, {with_gains[0]} torques (or currents with gains): one "
-            "model cannot use both A and N m; state gains for all of them"
+            f"{bare_currents[0]} contains currents without gains, {with_gains[0]} torques (or currents with gains): "
+            "one model cannot use both A and N m; state gains for all of them"
         )
     say("relative drive gains")
     return _relative(chain, options, [(path, motions[path]) for path in training if path in bare_currents])
@@ -118,8 +118,8 @@ def _from_pair(chain: Chain, options: IdentifyOptions, pair: GainPair, motions: 
     files = ", ".join(Path(parse_cut(name)[0]).name for name in (*pair.unloaded, *pair.loaded))
     notes = (
         f"drive gains from {files} ({gains.scale}): {printed}",
-        f"gains and payload are estimated from {files}: no independent validation data; no σ of a parameter contains "
-        "that of the gains",
+        f"gains and payload are estimated from {files}, so these do not validate the model; the σ of parameters do not "
+        "contain the uncertainty of the gains",
         *_poor_gains(gains),
     )
     with_loads = replace(options, settings=replace(settings, payload_values=loads))

@@ -97,7 +97,9 @@ def read_model(
     model, derivative_notes = _differentiable(model)
     cases = loads_of(loads, payloads, with_payloads=True)
     if options is not None and options.friction not in ("auto", "standard"):
-        notes.append(f"designed for standard friction: the step '{options.friction}' has its terms from recordings")
+        notes.append(
+            f"designed for standard friction, since the terms of '{options.friction}' are chosen from recordings"
+        )
     if chain.inertias is None and np.isfinite(limits.torque).any():
         sizes = ", ".join(f"{size:g}" for size in dict.fromkeys(limits.torque.tolist()))
         notes.append(f"NOT checked: torques (limits {sizes}), since the robot has no masses; name a model (--model)")

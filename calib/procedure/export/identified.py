@@ -294,8 +294,8 @@ def _link_bodies(robot: IdentifiedRobot, tree: UrdfTree, chain: Chain) -> tuple[
             loose_mass = sum(float(body[9]) for body in bodies if body is not None)
             raise RobotError(
                 f"{tree.where}: {total[9]:.3g} kg were identified between {joint.name} and the arm's next joint, and "
-                f"the file hangs {loose_mass:.3g} kg on link '{joint.child}' by joints that are not the arm's "
-                f"({listing(loose, 3)}): no possible body remains for the link. Either the motion does not identify "
+                f"the file attaches {loose_mass:.3g} kg to link '{joint.child}' by joints that are not the arm's "
+                f"({listing(loose, 3)}): no physically consistent body remains. Either the motion does not identify "
                 "that joint's mass (estimate.csv: its sigma), or the drive gains or the masses of those links are "
                 "wrong: correct these and identify again, or omit --urdf: then robot.urdf is the arm alone"
             )

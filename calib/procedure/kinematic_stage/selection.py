@@ -114,7 +114,7 @@ class Chosen:
         """Return text lines on the constraints that were checked, on those not checked, and on the run."""
         lines = []
         if self.checked:
-            lines.append(f"kept: {', '.join(self.checked)}")
+            lines.append(f"respected: {', '.join(self.checked)}")
         if self.unchecked:
             lines.append(f"NOT checked: {', '.join(self.unchecked)}")
         return lines + run_lines(self.run, self.driven)

@@ -35,7 +35,7 @@ DISPLACEMENT = 2e-5
 TURN = 2e-5
 ASSUMED = (
     f"predicted σ: for corner noise of {CORNER:g} px and a repeatability of {1e3 * DISPLACEMENT:g} mm and "
-    f"{1e3 * TURN:g} mrad per axis; unmodelled effects come on top"
+    f"{1e3 * TURN:g} mrad per axis; unmodelled effects are not included"
 )
 # times that views are drawn
 TRIES = 60

@@ -128,7 +128,7 @@ class _Tree:
         kind = kinds(int(model.jnt_type[j]))
         if kind not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
             free_or_ball = "free" if kind == kinds.mjJNT_FREE else "ball"
-            advice = "an arm has hinges and slides; give the robot's own file, not a scene with it"
+            advice = "an arm has hinges and slides only; give the robot's own file, not a scene with it"
             refuse_robot(self.where, f"body '{self.bodies[model.jnt_bodyid[j]]}' has a {free_or_ball} joint; {advice}")
         slides = kind == kinds.mjJNT_SLIDE
         limited = bool(model.jnt_limited[j])
@@ -187,7 +187,7 @@ class _Tree:
             tied |= {follower, leader}
         for k in range(model.nwrap):
             if model.wrap_type[k] != int(self.mj.mjtWrap.mjWRAP_JOINT) or int(model.wrap_objid[k]) not in tied:
-                refuse_robot(self.where, "a tendon moves it, which a serial arm does not have; take it out of the file")
+                refuse_robot(self.where, "a tendon moves it, which a serial arm does not have; remove it from the file")
         return mimics
 
 

@@ -59,7 +59,7 @@ def test_offsets_and_the_frames_beside_them_fit_better(fit):
 def test_every_controller_says_what_it_takes_and_what_is_closed(fit):
     for name, each in controllers().items():
         out = delivery_text(fit[0], each)
-        assert "It takes: " in out and "It does not: " in out and "instrument seen: " in out, name
+        assert "The controller accepts: " in out and "It does not accept: " in out and "instrument seen: " in out, name
 
 
 def test_signs_and_coupled_axes_are_undone():

@@ -97,10 +97,10 @@ def test_what_the_program_does_not_say_is_named_or_stated(fitted, tmp_path, caps
     (tmp_path / "frames.txt").write_text(line("UTOOL[2]", TOOL))
     words = "--frames", tmp_path / "frames.txt", "--tool", "0,0,0.1", *statements[2:]
     code, _, err = run(capsys, folder, path, "--out", tmp_path / "no.ls", *words)
-    assert code == 2 and "--tool says 0, 0, 100 mm" in err and "in the program's files" in err
+    assert code == 2 and "--tool states 0, 0, 100 mm" in err and "in the program's files" in err
     path.write_text(program(chain, "UF : F, UT : F"))
     code, _, err = run(capsys, folder, path, "--out", tmp_path / "no.ls")
-    assert code == 2 and "the tool that is active" in err and "the user frame that is active" in err
+    assert code == 2 and "the active tool" in err and "the active user frame" in err
 
 
 def test_a_configuration_that_is_not_the_poses_is_said_with_its_line(fitted, tmp_path, capsys):

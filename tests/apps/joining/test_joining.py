@@ -83,7 +83,7 @@ def test_a_wrong_order_of_rows_is_noticed_and_points_of_another_arm_are_refused(
     found = calib.join(joints, write(tmp_path / "p.csv", POINT, points), by="row", robot="lwr4plus")
     np.testing.assert_allclose(found.table.numbers("x", "length")[3], 1e-3 * points[7, 0])
     other = write(tmp_path / "o.csv", POINT, seen(arm, random_joints(arm, 40, 9)))
-    with pytest.raises(MeasurementError, match="not those of these 40 poses in any order"):
+    with pytest.raises(MeasurementError, match="do not fit the 40 poses in any order"):
         calib.join(joints, other, robot="lwr4plus")
     with pytest.raises(UsageError, match="by 'rows' is not one of name, time, row, geometry"):
         calib.join(joints, other, by="rows")

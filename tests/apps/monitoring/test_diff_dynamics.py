@@ -86,7 +86,7 @@ def test_the_command_writes_a_folder_and_exits_with_1_beyond_the_tolerance(model
 
 @pytest.mark.slow
 def test_what_cannot_be_compared_is_refused(models, tmp_path):
-    with pytest.raises(UsageError, match=r"nothing to compare: .* holds dynamics, panda holds the nominal robot"):
+    with pytest.raises(UsageError, match=r"nothing to compare: .* contains dynamics, panda contains the nominal robot"):
         calib.diff(models / "first", "panda")
     other = tmp_path / "other"
     robot = description.write(tmp_path / "ur5.toml", calib.load("ur5").chain)

@@ -125,7 +125,7 @@ def test_a_map_of_some_columns_is_completed_by_those_that_go_with_them(write, go
     "header, columns, said",
     [
         ("x_meas,y_meas,z_meas", {"x": "z_meas"}, "is read as two different columns"),
-        ("x,y,z,x_meas,y_meas,z_meas", {"x": "x_meas", "y": "y_meas"}, "z and z_meas could be it"),
+        ("x,y,z,x_meas,y_meas,z_meas", {"x": "x_meas", "y": "y_meas"}, "z and z_meas could be meant"),
         ("a,b,height", {"x": "a", "y": "b"}, "map this one"),
         ("x,y,z,qx_meas", {"qx": "qx_meas"}, "map this one"),
         ("x,y,z,std", {"sigma_distance": "std"}, "not read in a file of kind 'position'"),

@@ -20,7 +20,9 @@ def test_the_step_is_halved_until_the_loop_is_stable(
 
 def test_where_no_part_of_the_step_is_stable_that_is_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
     start, end = step(monkeypatch, 0.0)
-    with pytest.raises(CannotSimulate, match="no robot on the way to the estimate can be simulated: unstable"):
+    with pytest.raises(
+        CannotSimulate, match="no parameters between the start and the estimate can be simulated: unstable"
+    ):
         simulated_runs.nearer(start, end, [])
 
 

@@ -217,10 +217,10 @@ def test_waypoints_that_leave_a_joint_out_plan_no_shorter_arm(room, capsys):
     "change, message",
     [
         ({"M": -2.0}, "body after A4: a negative mass"),
-        ({"velocity": 0.0}, "no limit for the speed of A4 (velocity 0 is no limit)"),
-        ({"velocity": 1e8}, "no limit for the speed of A4 (velocity 1e+08 is no limit)"),
+        ({"velocity": 0.0}, "no limit for the speed of A4 (velocity 0 is not a limit)"),
+        ({"velocity": 1e8}, "no limit for the speed of A4 (velocity 1e+08 is not a limit)"),
         ({"velocity": np.inf}, "no limit for the speed of A4; without it"),
-        ({"effort": 0.0}, "no limit for the acceleration of A4 (effort 0 is no limit)"),
+        ({"effort": 0.0}, "no limit for the acceleration of A4 (effort 0 is not a limit)"),
     ],
 )
 def test_a_robot_that_cannot_be_is_not_planned_with(room, capsys, change, message):

@@ -390,4 +390,4 @@ def test_registers_that_a_controller_saved_are_no_program_to_compensate(fitted, 
         "[1,1] =   'P1'   Group: 1\n" + "  ".join(f"J{k} = 1.0 deg" for k in range(1, 7))
     )
     assert cli.run(["compensate", str(fitted), str(tmp_path / "POSREG.VA"), "--out", str(tmp_path / "o.VA")]) == 2
-    assert "lists registers that the controller saved, no program" in capsys.readouterr().err
+    assert "contains saved registers, not a program" in capsys.readouterr().err

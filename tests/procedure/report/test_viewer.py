@@ -171,7 +171,7 @@ def test_a_recording_that_fails_stops_nothing(fitted, monkeypatch):
 
 
 def test_folders_that_show_nothing_are_refused(tmp_path):
-    with pytest.raises(UsageError, match="holds no result; give a folder with measured poses"):
+    with pytest.raises(UsageError, match="contains no result; give a folder with measured poses"):
         viewing.read(tmp_path)
     with pytest.raises(UsageError, match="neither folder nor CSV"):
         viewing.read(tmp_path / "none")

@@ -54,7 +54,7 @@ def test_the_tip_is_the_flange(more, tip, why):
 
 def test_tool0_on_the_second_link_is_named_and_not_taken():
     found = ends(joint("t", "fixed", "link_2", "tool0"))
-    assert found.unused == ("tool0 is not taken: 4 axes follow it",)
+    assert found.unused == ("tool0 is not taken as the end: 4 axes follow it",)
     assert (
         urdf.ends(read_tree(robot(*WRIST, joint("t", "fixed", "link_2", "tool0")), "arm"), tip="tool0").tip == "tool0"
     )

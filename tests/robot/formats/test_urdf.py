@@ -193,7 +193,7 @@ def test_bad_files(source, message):
     "one, two, three, message",
     [
         (("revolute", "b"), ("revolute", ""), ("fixed", ""), r"joint 'a': the joint it mimics, 'b', comes after it"),
-        (("revolute", "b"), ("revolute", "a"), ("revolute", ""), r"joint 'a': it mimics a circle"),
+        (("revolute", "b"), ("revolute", "a"), ("revolute", ""), r"joint 'a': its <mimic> leads back to itself"),
         (("revolute", ""), ("revolute", "aa"), ("revolute", ""), r"joint 'b': it mimics 'aa', which is not a joint"),
         (("revolute", ""), ("floating", ""), ("revolute", ""), r"joint 'b': type 'floating' cannot be part of an arm"),
     ],

@@ -42,7 +42,7 @@ class ToolPart(ChangePart):
     @property
     def words(self) -> str:
         motion = self.change.motions[0]
-        return f"the tool moved by {1e3 * motion.rms:.3g} mm rms (σ lets expect {1e3 * motion.expected:.2g} mm)"
+        return f"the tool moved by {1e3 * motion.rms:.3g} mm rms (expected from σ: {1e3 * motion.expected:.2g} mm)"
 
     @property
     def basis(self) -> str:

@@ -55,7 +55,7 @@ class TorquePart(ChangePart):
     @property
     def words(self) -> str:
         change = self.judged
-        expected = f"σ lets expect {_rms(change.expected):.2g} {self.unit}"
+        expected = f"expected from σ: {_rms(change.expected):.2g} {self.unit}"
         return f"the torque changed by {change.rms:.3g} {self.unit} rms ({expected})"
 
     @property
