@@ -560,7 +560,7 @@ def _require_constrainable(method: Method, settings: IdentificationSettings) -> 
         return
     supporting = [name for name, candidate in METHODS.items() if candidate.takes_constraints]
     constrained = f"pc-{method.name}"
-    advice = f"methods that do: {', '.join(supporting)}"
+    advice = f"methods that support them: {', '.join(supporting)}"
     if constrained in supporting:
         advice = f"use '{constrained}'"
     raise UsageError(f"[constraints]: method '{method.name}' does not support them; {advice}")

@@ -127,7 +127,11 @@ class IdentificationSettings(Choices):
 
 def make_model(chain: Chain, settings: IdentificationSettings) -> IdentificationModel:
     """Return the model of a chain: bodies, payloads at the tip, and standard drive terms."""
-    require(not (settings.passive or settings.identical_legs), "passive, identical_legs: arms have no legs", UsageError)
+    require(
+        not (settings.passive or settings.identical_legs),
+        "passive, identical_legs: for parallel robots only; remove them",
+        UsageError,
+    )
     _check_joints(chain.n, settings)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
     values = settings.sets or (settings.torque_rows.drives,)
@@ -202,13 +206,15 @@ def require_usable(settings: IdentificationSettings, method: Method) -> Identifi
         )
     if not method.takes(rows):
         supporting = [name for name, candidate in METHODS.items() if candidate.takes(rows)]
-        refuse_option(option, f"rows = '{rows.name}' is not supported; methods that do: {', '.join(supporting)}")
+        refuse_option(
+            option, f"rows = '{rows.name}' is not supported; methods that support it: {', '.join(supporting)}"
+        )
     if friction == "auto":
         return replace(settings, friction=method.auto_friction)
     if friction != "standard" and not method.takes_models:
         supporting = [name for name, candidate in METHODS.items() if candidate.takes_models]
         refuse_option(
             option,
-            f"standard friction only, not friction = '{friction}'; methods that take it: {', '.join(supporting)}",
+            f"standard friction only, not friction = '{friction}'; methods that support it: {', '.join(supporting)}",
         )
     return settings

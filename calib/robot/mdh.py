@@ -165,7 +165,7 @@ def chain(name: str, rows: Sequence[Row], propose_beta: bool = True, **fields: A
         owner += row.kind != "fixed"
     massless = [row.name for row in moving if row.inertia is None]
     if massless and len(massless) < len(moving):
-        refuse_robot(f"robot '{name}'", f"row '{massless[0]}' has no inertia while others have")
+        refuse_robot(f"robot '{name}'", f"row '{massless[0]}' has no inertia while others have: state all, or none")
     inertias = None
     if not massless:
         inertias = np.array([row.inertia for row in moving], dtype=float)

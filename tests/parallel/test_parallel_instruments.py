@@ -146,7 +146,7 @@ def test_what_no_simulation_can_follow_is_said():
         ({"method": "ekf"}, r"parallel robots take ols, wls.*iv, didim, pc-iv, pc-didim, cloe, clie"),
         ({"method": "cloe", "rows": "power"}, r"rows = 'power' is not supported"),
         ({"method": "gtls"}, "differentiates the torques of a serial arm"),
-        ({"rows": "power"}, r"rows = 'power' is not supported; methods that do: ols, wls"),
+        ({"rows": "power"}, r"rows = 'power' is not supported; methods that support it: ols, wls"),
         ({"loop": None}, r"needs a \[loop\]|state the controller"),
     ],
 )

@@ -311,7 +311,7 @@ def read_motion(
         band=min(band, MAX_BAND * motion.rate),
     )
     wider = make_motion(recording, wider_options, sampled, motion.cutoffs)
-    note = f"f_p = {wider.band:.3g} Hz instead, so that decimation does not remove the ends of a short recording"
+    note = f"identification band f_p = {wider.band:.3g} Hz instead, since decimation would shorten the recording"
     return replace(wider, notes=(*motion.notes, note))
 
 
@@ -335,7 +335,7 @@ def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampl
     borders = 2.0 / cutoff if options.borders is None else options.borders
     sharper_options = replace(options, velocity_cutoff=_joints(motion.velocity_cutoff), borders=borders, cutoff=doubled)
     sharper = make_motion(recording, sharper_options, sampled, motion.cutoffs)
-    note = f"f_q = {doubled:.3g} Hz instead: the position noise is low enough"
+    note = f"cut-off of positions f_q = {doubled:.3g} Hz instead: the position noise is low enough"
     return replace(sharper, notes=(*motion.notes, note))
 
 

@@ -65,7 +65,7 @@ LOOP = LoopSettings(controller="pd", kp=(1.0,), kd=(1.0,))
 )
 def test_torque_rows_that_a_method_does_not_take_are_refused_with_all_that_do(method, rows, works, fails):
     settings = IdentificationSettings(method=method, torque_rows=rows, loop=LOOP)
-    with pytest.raises(UsageError, match=f"rows = '{rows.name}' is not supported; methods that do: ") as caught:
+    with pytest.raises(UsageError, match=f"rows = '{rows.name}' is not supported; methods that support it: ") as caught:
         require_usable(settings, METHODS[method])
     named = str(caught.value).split(": ")[-1].split(", ")
     assert set(works.split()) <= set(named) and not set(fails.split()) & set(named)
@@ -78,7 +78,7 @@ def test_friction_is_what_the_method_takes():
         "auto", "auto", "standard", "standard", "auto",
     ]  # fmt: skip
     assert require_usable(replace(auto, friction="stribeck"), METHODS["clie"]).friction == "stribeck"
-    with pytest.raises(UsageError, match=r"standard friction only.* methods that take it: .*iv"):
+    with pytest.raises(UsageError, match=r"standard friction only.* methods that support it: .*iv"):
         require_usable(replace(auto, friction="stribeck"), METHODS["ukf"])
 
 
@@ -90,5 +90,5 @@ def test_friction_without_derivatives_is_refused_by_name():
     terms = drives.offered("presliding", 0, RecordedRange(0.2, 2.0, 3.0, 3.0))
     rows = tuple(one.extend(terms, np.ones((*one.target.shape, len(terms)))) for one in problem.rows)
     found = replace(problem, rows=rows, terms=(*problem.terms, *terms))
-    with pytest.raises(Exception, match=r"no derivatives .* iv and didim take it"):
+    with pytest.raises(Exception, match=r"no derivatives .* iv and didim support it"):
         comparison(found, "cloe").linearised(np.zeros(len(found.terms)))
