@@ -97,7 +97,9 @@ def read_table(folder: Path) -> ParsedTable:
     ):
         table = json.loads((folder / MODEL).read_text(encoding="utf-8"))
     if not isinstance(table, dict):
-        raise RobotError(f"{folder}/dynamics.json is damaged or of another version: it contains no table")
+        raise RobotError(
+            f"{folder}/dynamics.json is damaged or of another version (it contains no table); identify again"
+        )
     return table
 
 

@@ -485,12 +485,16 @@ def _check(opened: OpenedRobot, text: str, where: str, postures: int = 5) -> Non
             gap_size = max(gap_size, float(np.abs(gap).max()))
     if gap_size > MAX_DIFFERENCE:
         raise RobotError(
-            f"{where}: loops stay {gap_size:.2g} m (or rad) open when Pinocchio reads it; nothing was written"
+            f"{where}: loops stay {gap_size:.2g} m (or rad) open when Pinocchio reads it; nothing was written: "
+            "report this as a bug"
         )
     largest = max(1.0, float(np.abs(expected).max()))
     off = float(np.abs(forces - expected).max()) / largest
     if off > MAX_DIFFERENCE:
-        raise RobotError(f"{where}: forces differ by {off:.2g} of the largest when Pinocchio reads it; nothing written")
+        raise RobotError(
+            f"{where}: forces differ by {off:.2g} of the largest when Pinocchio reads it; nothing was written: "
+            "report this as a bug"
+        )
 
 
 def _models(text: str) -> list[NativeModel]:

@@ -432,7 +432,9 @@ def _deflection(table: ParsedTable, chain: Chain, where: str) -> Deflection:
         check_keys(entry, ("element", "basis", "joint", "order", "coefficient"), where)
         for key, names in (("element", chain.names), ("joint", chain.joint_names)):
             if entry.get(key) not in names:
-                refuse_robot(where, f"{key} {entry.get(key)!r} does not exist in the robot")
+                refuse_robot(
+                    where, f"{key} {entry.get(key)!r} does not exist in the robot; correct or remove this entry"
+                )
         source = chain.joint_names.index(entry["joint"])
         terms.append(Term(entry["element"], entry.get("basis", ""), source, int(entry.get("order", 0))))
         coefficients.append(number(entry.get("coefficient"), f"{where}, coefficient"))

@@ -44,7 +44,10 @@ class _Cluster:
             if threads:
                 self.manned = time_now
             elif time_now > self.manned + NO_WORKERS:
-                raise CalibError(f"the Dask scheduler at {self.address} has had no workers for {NO_WORKERS:g} s")
+                raise CalibError(
+                    f"the Dask scheduler at {self.address} has had no workers for {NO_WORKERS:g} s: start workers, "
+                    "then repeat the command"
+                )
         return self.threads
 
     def _said(self, ask: Callable[[], T]) -> T:

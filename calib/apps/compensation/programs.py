@@ -141,7 +141,9 @@ def compensated(
     n = fitted.nominal.chain.n
     if joints and len(program.targets[joints[0]].values) != n:
         axes = len(program.targets[joints[0]].values)
-        raise UsageError(f"{program.path}: its targets have {axes} axes, the robot has {n} joints")
+        raise UsageError(
+            f"{program.path}: its targets have {axes} axes, but the robot has {n} joints: is it for another robot?"
+        )
     groups, notes = (), ()
     if poses:
         placement = placed(fitted, program, frame, statements)

@@ -91,7 +91,7 @@ def read_image_bag(
     with opened(path) as reader:
         states = connections_of(reader, JOINT_STATE, joint_topic, path, "joint states", "--joint-topic")
         names, parts, _ = joint_states(reader, states, None, path)
-        few = f"{len(parts['q'])} joint states are too few to interpolate joint values"
+        few = f"{len(parts['q'])} joint states are too few to interpolate joint values: is the topic the right one?"
         require(len(parts["q"]) >= 2, few, MeasurementError, path)
         order = np.argsort(parts["stamp"], kind="stable")
         connections = connections_of(reader, IMAGE, image_topic, path, "images", "--image-topic")

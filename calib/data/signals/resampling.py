@@ -331,7 +331,7 @@ def resample(recording: Recording, clock: str = "auto", gap: float = GAP, rate: 
         else:
             dropped.append((float(t[start]), float(duration)))
     if not segments:
-        message = f"has gaps: none of its {len(spans)} parts is longer than {MIN_SAMPLES} samples"
+        message = f"has gaps: none of its {len(spans)} parts is longer than {MIN_SAMPLES} samples; record without gaps"
         refuse_data(recording.file, message)
 
     grids: list[np.ndarray] = []

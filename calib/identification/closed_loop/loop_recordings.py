@@ -92,7 +92,7 @@ def close_loops(
             if usable.stop - usable.start > 2 * len(decimator.taps):
                 stretches.append(part)
     if not stretches:
-        refuse_data(cases[0].motion.file, "no part without gaps is long enough to be simulated")
+        refuse_data(cases[0].motion.file, "no part without gaps is long enough to be simulated: record longer")
     ordered = sorted(stretches, key=lambda part: -len(part.motion))
     controller, identified, notes = _controller(loop, ordered[0])
     shifts: dict[str, float] = {}

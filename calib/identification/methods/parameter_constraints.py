@@ -352,7 +352,9 @@ def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.n
     if np.abs(base.transform.T @ base_row - standard).max() > 1e-6 * max(np.abs(standard).max(), 1e-300):
         refuse_option("[constraints]", _without_effect(weights, base))
     row[: base.b] += base_row
-    require(row.any(), f"[constraints]: the weights of {', '.join(weights)} sum to zero", UsageError)
+    require(
+        row.any(), f"[constraints]: the weights of {', '.join(weights)} sum to zero; state other weights", UsageError
+    )
     return row
 
 

@@ -213,7 +213,10 @@ def closed(robot: ParallelRobot) -> ClosedRobot:
     rows = _reading_rows(opened, links)
     rcond = float(_platform_rcond(opened, rows, rows)[0])
     if rcond < SINGULAR:
-        robot.refuse(f"home is singular (type 2): locked actuators do not hold it, rcond {rcond:.1g}")
+        robot.refuse(
+            f"home is singular (type 2): locked actuators do not hold the platform (rcond {rcond:.1g}); state "
+            "another home"
+        )
     signs = frozen(_determinants(opened, links)[0])
     return ClosedRobot(robot, start, minors, signs, fixed)
 

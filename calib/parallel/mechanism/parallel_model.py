@@ -119,7 +119,9 @@ class ParallelModel:
             for leg in legs:
                 leg_kinds = [joint.kind for joint in leg.chain.joints]
                 if leg.bodies != legs[0].bodies or leg_kinds != kinds:
-                    raise UsageError(f"identical_legs: {leg.name} is built unlike {legs[0].name}")
+                    raise UsageError(
+                        f"identical_legs: {leg.name} is built unlike {legs[0].name}; remove identical_legs"
+                    )
         doubled = sorted({name for name in self.names if self.names.count(name) > 1})
         if doubled:
             raise CalibError(f"parameter '{doubled[0]}' occurs twice; give the payload or term another name")

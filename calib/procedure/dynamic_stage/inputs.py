@@ -311,7 +311,7 @@ def read_motion(
         band=min(band, MAX_BAND * motion.rate),
     )
     wider = make_motion(recording, wider_options, sampled, motion.cutoffs)
-    note = f"identification band f_p = {wider.band:.3g} Hz instead, since decimation would shorten the recording"
+    note = f"identification band f_p = {wider.band:.3g} Hz instead, to keep the ends of a short recording"
     return replace(wider, notes=(*motion.notes, note))
 
 

@@ -225,7 +225,7 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str], nominal: Chain
     parameters = np.array([value_of[name] for name in model.names])
     if not np.isfinite(parameters).all():
         name = model.names[int(np.argmin(np.isfinite(parameters)))]
-        raise UsageError(f"{folder}: parameter {name} of the model is not finite")
+        raise UsageError(f"{folder}: parameter {name} of the model is not finite; identify again")
     friction = any(term.shape == "sign" for term in model.columns)
     excited = excited_model(model, loads, parameters, friction, notes, nominal)
     covariance = covariance_of(folder / COVARIANCE, excited.exact)

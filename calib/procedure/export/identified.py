@@ -324,7 +324,8 @@ def _check(robot: IdentifiedRobot, source: str, chain: Chain, where: str, mjcf: 
         difference = float(np.abs(frames - moving_frames(robot.chain, q)).max())
         if difference > MAX_DIFFERENCE:
             raise RobotError(
-                f"{where}: poses differ by {difference:.2g} when Pinocchio reads the file; nothing was written"
+                f"{where}: poses differ by {difference:.2g} when Pinocchio reads the file; nothing was written: "
+                "report this as a bug"
             )
     share = float(np.abs(torques - expected).max()) / max(1.0, float(np.abs(expected).max()))
     if share > MAX_DIFFERENCE:
@@ -334,7 +335,7 @@ def _check(robot: IdentifiedRobot, source: str, chain: Chain, where: str, mjcf: 
         )
     for quantity, values, column in (("damping", damping, 1), ("friction", friction, 2)):
         if not np.allclose(values, robot.drives.values[:, column], rtol=MAX_DIFFERENCE, atol=1e-12):
-            raise RobotError(f"{where}: Pinocchio reads another {quantity} than was written")
+            raise RobotError(f"{where}: Pinocchio reads another {quantity} than was written: report this as a bug")
 
 
 def without_left(dynamics: Dynamics) -> Dynamics:

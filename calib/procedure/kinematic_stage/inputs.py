@@ -462,6 +462,7 @@ def _with_frames_of_fit(block: PoseMeasurements, fit: Sequence[PoseMeasurements]
     if len(block.tool_names) != len(fit[0].tool_names):
         tools = ", ".join(block.tool_names)
         raise UsageError(
-            f"{block.file}: the fit has no tool {tools}, only {', '.join(sorted(fit_tools))}; refit_frames"
+            f"{block.file}: the fit has no tool {tools}, only {', '.join(sorted(fit_tools))}; refit its frames "
+            "(--refit-frames)"
         )
     return replace(block, tool_names=fit[0].tool_names)

@@ -174,7 +174,9 @@ def checked(answers: Answers) -> FieldValues:
     instrument_named(instrument or "")
     of_camera = [name for name in CAMERA if getattr(answers, name) is not None]
     if of_camera and _measures(answers) != IMAGES:
-        raise CalibError(f"--{of_camera[0]} applies to a camera that takes images; the instrument is {instrument}")
+        raise CalibError(
+            f"--{of_camera[0]} applies to a camera that takes images; the instrument is {instrument}: leave it out"
+        )
     dynamics = answers.dynamics is not False
     if not dynamics and (answers.payloads or answers.torques):
         raise UsageError("--payload and --torques apply to the dynamics, which --geometry-only excludes")

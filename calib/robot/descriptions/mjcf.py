@@ -177,9 +177,7 @@ class _Tree:
                 refuse_robot(self.where, f"equality '{name}' closes a loop; describe such a robot as a parallel one")
             offset, ratio, *higher = model.eq_data[k, :5]
             if any(higher):
-                refuse_robot(
-                    self.where, f"equality '{name}' of '{self.joints[follower]}' is no straight line; edit polycoef"
-                )
+                refuse_robot(self.where, f"equality '{name}' of '{self.joints[follower]}' is not linear; edit polycoef")
             follower_reference = model.qpos0[model.jnt_qposadr[follower]]
             leader_reference = model.qpos0[model.jnt_qposadr[leader]]
             urdf_offset = repr(float(follower_reference + offset - ratio * leader_reference))
