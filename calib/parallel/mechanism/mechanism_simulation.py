@@ -143,7 +143,11 @@ class ParallelPlant:
             require(term.shape in SHAPES, f"term '{term.name}' ({term.shape}) cannot be simulated", UsageError)
             drives[term.joint, SHAPES[term.shape]] += value
             if term.shape == "sign":
-                require(term.settings[0] > 0.0, f"'{term.name}' cannot be simulated without v0 above 0", CannotSimulate)
+                require(
+                    term.settings[0] > 0.0,
+                    f"term '{term.name}' cannot be simulated: state its v0, above 0",
+                    CannotSimulate,
+                )
                 drives[term.joint, 4] = term.settings[0]
         legs = zip(model.legs, model.leg_parameters(values))
         bodies_values = [rigid_body.kernel_parameters(bodies, parameters) for (bodies, *_), parameters in legs]

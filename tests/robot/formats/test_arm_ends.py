@@ -43,7 +43,7 @@ def ends(*more: str, names: list[str] | None = None, base: str | None = None) ->
         ([fixed("link_ee"), fixed("camera_link", "link_ee")], "link_ee", "end-effector"),
         ([fixed("probe"), fixed("camera")], "probe", "no gripper or sensor"),
         ([fixed("hand"), moving("finger_1", "hand"), moving("finger_2", "hand")], "link_6", "no gripper"),
-        ([fixed("a"), fixed("b"), fixed("c")], "link_6", "a, b, c hang on it; --tip"),
+        ([fixed("a"), fixed("b"), fixed("c")], "link_6", "a, b, c are attached to it; choose one"),
         ([joint("t", "fixed", "link_2", "tool0")], "link_6", "the last link"),
     ],
 )

@@ -141,7 +141,7 @@ class TorquePart(ChangePart):
         text = f"{change.where}: the torque changed by {change.rms:.3g} {self.unit} rms"
         if change.unexplained:
             earlier, later = change.unexplained
-            text += f"; the earlier model leaves {earlier:.3g} % of it unexplained, the later one {later:.3g} %"
+            text += f"; the earlier model leaves {earlier:.3g} % of the torque unexplained, the later one {later:.3g} %"
         return text
 
     def charts(self) -> dict[str, Chart]:
