@@ -162,7 +162,7 @@ def identify_model(
     """
     settings = settings or IdentificationSettings()
     say = progress or (lambda message: None)
-    require(cases, "no recording to identify the model from", UsageError)
+    require(cases, "no recording to identify the model from: give at least one", UsageError)
     method = method_named(settings.method)
     settings = require_usable(settings, method)
     _require_constrainable(method, settings)
@@ -569,4 +569,6 @@ def _require_constrainable(method: Method, settings: IdentificationSettings) -> 
 def _require_motion(cases: Sequence[Case]) -> None:
     """Raise an error for training cases without motion."""
     if all((np.ptp(case.motion.q, axis=0) < MIN_MOTION).all() for case in cases):
-        refuse_data(cases[0].motion.file, "no joint moves: only gravity in one pose is identifiable")
+        refuse_data(
+            cases[0].motion.file, "no joint moves, so only gravity in one pose is identifiable: record a motion"
+        )

@@ -130,7 +130,9 @@ def refuse_other_arm(folder: Path, chain: Chain) -> None:
     identified = description.read(folder / ROBOT)
     if identified.n != chain.n:
         refuse_option(
-            folder, f"is of a robot with {identified.n} joints ({identified.name}), {chain.name} has {chain.n}"
+            folder,
+            f"is of a robot with {identified.n} joints ({identified.name}), but {chain.name} has {chain.n}: identify "
+            "this robot",
         )
     q = random_joints(chain, 20, 0)
     tips = forward(chain, q)[:, :3, 3]
@@ -139,7 +141,9 @@ def refuse_other_arm(folder: Path, chain: Chain) -> None:
     reach = float(np.linalg.norm(tips, axis=1).max())
     if distance > MAX_TIP_DISTANCE * reach:
         refuse_option(
-            folder, f"is of another robot ({identified.name}): its tip is {distance:.3g} m from {chain.name}'s (median)"
+            folder,
+            f"is of another robot ({identified.name}): its tip is {distance:.3g} m from that of {chain.name} "
+            "(median); identify this robot",
         )
 
 

@@ -244,7 +244,9 @@ def refuse_options_of_arms(settings: IdentificationSettings, options: IdentifyOp
     read = {field.name for field in fields(settings)} - OF_ARMS
     refuse_unread(settings, IdentificationSettings(), read, options.source)
     if settings.friction not in ("auto", "standard"):
-        raise UsageError(f"friction = '{settings.friction}': a parallel robot has standard friction only (Fv Fc off)")
+        raise UsageError(
+            f"friction = '{settings.friction}': a parallel robot has standard friction only (Fv Fc off): remove the key"
+        )
     method = method_named(settings.method)
     if _of_arms(method):
         activity = "simulates" if method.needs_simulation else "differentiates the torques of"

@@ -185,7 +185,7 @@ def _read_waypoints(path: Path | np.ndarray, mechanism: ClosedRobot) -> np.ndarr
         readings = read_rows(path, mechanism.robot)[:, : mechanism.robot.n]
         return coordinates_of(mechanism, mechanism.locate(readings))
     except NoPosture as error:
-        raise MeasurementError(f"waypoint out of reach: {error}", path) from error
+        raise MeasurementError(f"waypoint out of reach: {error}; move it", path) from error
 
 
 def _law(robot: ParallelMechanism, folder: Path | None, payloads: tuple[str, ...]) -> _PlatformDynamics:

@@ -285,7 +285,7 @@ def computed(
     goal = Goal(calibrated_cell, count, chain.lower, chain.upper)
     if start is not None and not _inside(nominal_goal, np.asarray(start)):
         limits = f"{chain.lower.tolist()} to {chain.upper.tolist()}"
-        raise UsageError(f"start {list(start)}: outside the joints' limits {limits}")
+        raise UsageError(f"start {list(start)}: outside the joints' limits {limits} [rad, m]: state values within them")
 
     say("the nominal robot at the targets")
     poses, nominal_q = _reference(nominal_goal, targets, start, seed)

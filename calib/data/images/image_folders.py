@@ -115,7 +115,7 @@ def joint_table(path: Path) -> Table:
     table = read_table(file)
     for name, count in Counter(table.texts("image")).items():
         if count > 1:
-            raise MeasurementError(f"'{name}' occurs {count} times", file, column="image")
+            raise MeasurementError(f"'{name}' occurs {count} times: one row per image is needed", file, column="image")
     return table
 
 
@@ -203,7 +203,8 @@ def _own_lens(path: Path, size: tuple[int, int], options: FileOptions) -> tuple[
     lens = read_lens(file)
     if size[0] and lens.size != size:
         raise MeasurementError(
-            f"is for images of {lens.size[0]} x {lens.size[1]} pixels, the images here have {size[0]} x {size[1]}", file
+            f"is for images of {lens.size[0]} x {lens.size[1]} pixels, but the images here have {size[0]} x {size[1]}",
+            file,
         )
     return lens, True
 

@@ -368,7 +368,12 @@ def _sigma(sheet: Sheet, layout: Layout, visible: np.ndarray) -> np.ndarray | No
         sigma = sheet.numbers(names, replace(SIGMA, positive=""), gaps=not is_seen.all())
         sigma = np.where(sigma < 0.0, sigma, np.maximum(sigma, options.floor))
         SIGMA.check(np.where(is_seen, sigma, np.nan), sheet.table, names)
-        refuse(sheet.table, np.isnan(sigma) & is_seen, names, lambda row, k: "is empty where a target was seen")
+        refuse(
+            sheet.table,
+            np.isnan(sigma) & is_seen,
+            names,
+            lambda row, k: "is empty where a target was seen: state σ for every row, or remove the column",
+        )
         stack.append(sigma)
     return np.stack(stack, axis=1)
 

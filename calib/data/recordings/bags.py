@@ -142,7 +142,9 @@ def _stack(values: list[object], series: str, path: Path) -> np.ndarray:
     if len(missing) == len(values):
         return np.empty((0, 0))
     if missing:
-        refuse_data(path, f"this message has no {series}, other messages have", series, missing[0] + 1)
+        refuse_data(
+            path, f"this message has no {series}, unlike other messages: cut this part out", series, missing[0] + 1
+        )
     return np.array(values)
 
 

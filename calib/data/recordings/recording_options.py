@@ -278,7 +278,7 @@ def _two_torques(names: dict[str, str], options: RecordingOptions, members: tupl
 def joint_order(names: list[str], joints: Joints | None, n: int, path: str | Path) -> tuple[list[int], tuple[str, ...]]:
     """Return the indices of the robot's joints among the file's, and their names; the file may have more joints."""
     if names and len(names) != n:
-        refuse_data(path, f"joint_names has {len(names)} names for {n} columns")
+        refuse_data(path, f"joint_names has {len(names)} names for {n} columns: state one per column")
     if joints is None or not names:
         column_names: Sequence[str] = names
         if joints is not None and len(joints.names) == n:

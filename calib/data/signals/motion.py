@@ -287,7 +287,9 @@ def with_reference(motion: Motion, path: Path, joints: Joints, options: Recordin
     else:
         t, q = read_positions(path, joints, options)
     if q.shape[1:] != (motion.n,):
-        refuse_data(path, f"has {q.shape[1]} joints, the recording has {motion.n}")
+        refuse_data(
+            path, f"has {q.shape[1]} joints, the recording has {motion.n}: is it the reference of this recording?"
+        )
     if len(t) < MIN_REFERENCE_SAMPLES or not np.isfinite(q).all() or not (np.diff(t) > 0.0).all():
         refuse_data(path, "a reference needs ten samples or more, finite numbers and increasing stamps")
     slack = 1.5 * float(np.median(np.diff(t)))

@@ -102,7 +102,9 @@ def find_clock(recording: Recording, kind: str = "auto") -> SampleClock:
         dates, keep, period, step_ratio = counted
         clocks["counted"] = (dates, keep, period)
     if kind != "auto" and kind not in clocks:
-        raise UsageError(f"clock '{kind}': cannot date the samples of {recording.file or 'this recording'}")
+        raise UsageError(
+            f"clock '{kind}': cannot date the samples of {recording.file or 'this recording'}; use clock = 'auto'"
+        )
     roughness = {name: _roughness(recording.q, *clock) for name, clock in clocks.items()}
     roughness_of_stamps = max(roughness["stamps"], 1e-300)
     relative = {name: value / roughness_of_stamps for name, value in roughness.items()}

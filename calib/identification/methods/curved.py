@@ -208,7 +208,7 @@ def _parsed(text: str, location: str) -> tuple[ast.expr, tuple[str, ...]]:
         allowed = f"parameters' names, numbers, + - * / **, {' '.join(_KNOWN)}, and one >= or <="
         refuse_option(location, f"expected {allowed}; found '{wrong}'")
     if not names:
-        refuse_option(location, "names no parameter")
+        refuse_option(location, "contains no parameter: state at least one")
     return tree, names
 
 

@@ -206,7 +206,7 @@ def closed(robot: ParallelRobot) -> ClosedRobot:
             )
         rcond = float(_leg_rcond(leg_link, leg_link)[0])
         if rcond < SINGULAR:
-            robot.refuse(f"{leg.name} {_why_singular(robot, start, leg)}: rcond {rcond:.1g}")
+            robot.refuse(f"{leg.name} {_why_singular(robot, start, leg)} (rcond {rcond:.1g}): correct home or lengths")
     minors = tuple(_best_rows(link.jacobian[0]) for link in links)
     fixed = _check_freedom(robot, start, links)
     opened = ClosedRobot(robot, start, minors, np.zeros(len(links) + 1), fixed)
@@ -513,7 +513,10 @@ def _check_freedom(robot: ParallelRobot, home: Posture, links: Sequence[LegLinks
             )
         if np.linalg.cond(free_motions[:, robot.selected]) > 1e8:
             motions = _motions(free_motions)
-            robot.refuse(f"the platform can move in {motions}; freedom lists {', '.join(robot.freedom)}")
+            robot.refuse(
+                f"the platform can move in {motions}, but the key 'freedom' lists {', '.join(robot.freedom)}: "
+                "correct it"
+            )
         fixed = fixed and float(np.abs(constraints @ freedoms).max()) < 1e-9
         if trial == 3:
             break

@@ -392,7 +392,11 @@ def _with_design(
             part = slice(start, stop)
             q_ref = frozen(design.orders(motion.t[part] - located.began)[0])
             return replace(motion.part(part), q_ref=q_ref, located=located.began)
-    refuse_data(motion.file, "has no reference positions (q_ref), and contains none of the designed motions whole")
+    refuse_data(
+        motion.file,
+        "has no reference positions (q_ref), and contains none of the designed motions whole: log the reference, or "
+        "record again",
+    )
 
 
 def _check_files(options: IdentifyOptions, paths: Sequence[str]) -> None:

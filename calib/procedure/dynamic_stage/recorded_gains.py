@@ -55,7 +55,9 @@ class FoundGains:
         """
         if options.gains is not None:
             if len(options.gains) not in (1, motion.n):
-                raise UsageError(f"gains: {len(options.gains)} values for {motion.n} joints ({motion.file})")
+                raise UsageError(
+                    f"gains: {len(options.gains)} values for {motion.n} joints ({motion.file}): state one per joint"
+                )
             return np.broadcast_to(np.array(options.gains), (motion.n,))
         if motion.kind != "current":
             return None

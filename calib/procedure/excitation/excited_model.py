@@ -186,7 +186,11 @@ def loads_of(texts: Sequence[str], payloads: Sequence[str], with_payloads: bool)
             labels = tuple(part.strip() for part in text.split("+"))
         for label in labels:
             where = f"load '{text}': payload"
-            require(payloads, f"{where} '{label}' is not known: options or model have no payloads", UsageError)
+            require(
+                payloads,
+                f"{where} '{label}' is not known, since options or model have no payloads: leave it out",
+                UsageError,
+            )
             one_of(label, payloads, where, UsageError)
         runs.append(labels)
     return tuple(runs)

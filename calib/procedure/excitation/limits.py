@@ -548,6 +548,8 @@ def _friction(table: FrictionTable | None, chain: Chain, where: str) -> np.ndarr
     for key, coefficients in (("Fv", table.Fv), ("Fc", table.Fc)):
         joint_values = coefficients or (0.0,) * chain.n
         if len(joint_values) not in (1, chain.n):
-            raise UsageError(f"{where}: friction.{key}: {len(joint_values)} values for {chain.n} joints")
+            raise UsageError(
+                f"{where}: friction.{key}: {len(joint_values)} values for {chain.n} joints: state one per joint"
+            )
         result.append(np.broadcast_to(np.array(joint_values), (chain.n,)))
     return np.array(result)

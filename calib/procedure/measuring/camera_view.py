@@ -249,7 +249,7 @@ def camera_view(table: CameraTable, chain: Chain, where: str, folder: Path) -> C
         UsageError, MeasurementError, RobotError: for a missing file, or an impossible placement.
     """
     for name in (table.lens, table.board):
-        require((folder / name).is_file(), f"{where}: camera: no file '{name}' next to it", UsageError)
+        require((folder / name).is_file(), f"{where}: camera: no file '{name}' next to it: copy it there", UsageError)
     if not table.range[0] < table.range[1]:
         raise UsageError(f"{where}: camera.range: {table.range[0]:g} is not below {table.range[1]:g}")
     lens = read_lens(folder / table.lens)

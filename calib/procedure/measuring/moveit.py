@@ -58,7 +58,9 @@ def moveit_files(path: Path) -> list[Path]:
     if len(srdf) > 1:
         raise UsageError(f"{path} has {len(srdf)} SRDF files: give one of them, as {srdf[0]}")
     if not limits and not srdf:
-        raise UsageError(f"{path}: neither {JOINT_LIMITS} nor *{SRDF} in this folder or its config")
+        raise UsageError(
+            f"{path}: neither {JOINT_LIMITS} nor *{SRDF} in this folder or its config folder: give the MoveIt package"
+        )
     return [*limits[:1], *srdf]
 
 
@@ -113,7 +115,11 @@ def _limits(path: Path, chain: Chain, source: Path | None) -> ParsedTable:
         if upper is None:
             upper = joint.upper
         tables.setdefault("joints", {})[joint.name] = [lower, upper]
-    require(tables, f"{path}: limits no joint of the arm ({', '.join(chain.joint_names)})", UsageError)
+    require(
+        tables,
+        f"{path}: limits no joint of the arm ({', '.join(chain.joint_names)}): is it for another robot?",
+        UsageError,
+    )
     return tables
 
 

@@ -402,8 +402,8 @@ def _is_macro(node: Node) -> bool:
 def _fresh(node: Node, names: Iterable[str], where: str) -> str:
     """Return the name of a link or joint; refuse a missing or duplicate name."""
     name = node.attributes.get("name", "")
-    require(name, f"{where}, line {node.line}: a <{node.tag}> without a name", RobotError)
-    require(name not in names, f"{where}, line {node.line}: a second {node.tag} named '{name}'", RobotError)
+    require(name, f"{where}, line {node.line}: a <{node.tag}> without a name: add one", RobotError)
+    require(name not in names, f"{where}, line {node.line}: a second {node.tag} named '{name}': rename one", RobotError)
     return name
 
 

@@ -99,7 +99,7 @@ def test_it_holds_beside_bodies_bounds_and_another(problem):
         (CurvedConstraint("Fv1.real >= 0"), "found 'Fv1.real'"),
         (CurvedConstraint("0 <= Fv1 <= 1"), "found '0 <= Fv1 <= 1'"),
         (CurvedConstraint("Fv1 >="), "is not a formula"),
-        (CurvedConstraint("2 >= 1"), "names no parameter"),
+        (CurvedConstraint("2 >= 1"), "contains no parameter"),
         (CurvedConstraint("Fz1**2 >= 1"), "'Fz1' is not a parameter of this model"),
         (CurvedConstraint("M2 * Fv1 >= 1"), "M2 has no effect"),
     ],
