@@ -97,7 +97,7 @@ def minimise(
     values = np.array(solution.x)[:p]
     if str(solution.status) not in OPTIMAL:
         raise NotConverged(
-            f"the constraints may contradict each other (Clarabel reports {solution.status}): relax or remove some",
+            f"the constraints may contradict each other: Clarabel reports {solution.status}; relax or remove some",
             values,
         )
     dual = np.array(solution.z)
