@@ -363,7 +363,7 @@ def _objection(
 ) -> str:
     """Return why no posture has the configuration, or why it is not unique; else empty."""
     if not len(agreeing) and configuration.agrees(chain, reached).any():
-        return f"{configuration.text} has no posture at this pose: none within the joints' limits has its turns"
+        return f"{configuration.text} has no posture at this pose: none within the joints' limits has the stated turns"
     if not len(agreeing):
         signs = signs_at(chain, reached, np.array(configuration.upright))
         alternatives = "; ".join(_sign_text(row) for row in np.unique(signs, axis=0))

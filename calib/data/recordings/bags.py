@@ -151,7 +151,7 @@ def _stack(values: list[object], series: str, path: Path) -> np.ndarray:
 def _refuse_joints(names: Sequence[str], message_names: Sequence[tuple[str, ...]], path: Path) -> None:
     require(message_names, "its topic of joint states has no messages", MeasurementError, path)
     bag_names = sorted(set().union(*message_names))
-    fault = "no message with all joints at once"
+    fault = "no message with all joints of the robot at once"
     missing = [name for name in names if name not in bag_names]
     if missing:
         fault = f"no joint '{missing[0]}'{suggestion(missing[0], bag_names)}"

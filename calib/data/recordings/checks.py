@@ -63,7 +63,7 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
         MeasurementError: for too few samples, values that are not finite, stamps that do not increase, degrees in place
             of radians, or a torque that is constant while its joint moves.
     """
-    few = f"{len(recording)} samples are too few for filters; at least {LIMITS.min_samples} are needed"
+    few = f"{len(recording)} samples are too few for filters; record {LIMITS.min_samples} or more"
     require(len(recording) >= LIMITS.min_samples, few, MeasurementError, recording.file)
     recording = _without_absent(recording)
     _check_finite(recording)

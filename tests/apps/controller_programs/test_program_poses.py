@@ -112,7 +112,7 @@ def test_a_configuration_that_is_not_the_poses_is_said_with_its_line(fitted, tmp
     assert code == 2 and "CONFIG N U B 0 0 0 (behind axis 1" in err and "before axis 1" in err
     path.write_text(program(chain, configuration="N U T, 3, 0, 0"))
     code, _, err = run(capsys, folder, path, "--out", tmp_path / "no.ls", *statements)
-    assert code == 2 and "none within the joints' limits has its turns" in err and "line 9: " in err
+    assert code == 2 and "none within the joints' limits has the stated turns" in err and "line 9: " in err
     near = ",".join(map(str, Q[0]))
     code, out, err = run(capsys, folder, path, "--out", tmp_path / "near.ls", "--start", near, *statements)
     assert code == 0 and "warning: line 9: CONFIG N U T 3 0 0 has no posture" in out, err

@@ -377,7 +377,7 @@ def test_a_target_of_a_program_that_is_not_reached_is_named_with_its_line(cell, 
     near = ("--start", "0,-1,1,0,1,0", "--partial", *AT_FLANGE)
     code, out, err = calib("compensate", fitted, "part.src", "--out", "sent.src", *near)
     assert "warning: 4 moves, 3 targets" in out
-    assert code == 0 and "1 of 3 targets written" in out and "left as it was: line 4: " in out, err
+    assert code == 0 and "1 of 3 targets written" in out and "target unchanged: line 4: " in out, err
     assert (here / "sent.src").read_text().split("\n")[3:] == text.split("\n")[3:]
     (here / "joints.src").write_text("\n".join(line for line in text.split("\n") if "LIN" not in line))
     code, _, err = calib("compensate", fitted, "joints.src", "--out", "no.src")
