@@ -189,7 +189,9 @@ def caveats(inputs: IdentificationInputs, compared: Sequence[ComparedMethod]) ->
     else:
         for method in compared:
             if method.verdict is not None and method.verdict.level == "fail":
-                message = f"no method recommended: the model of {method.name} fails in calib identify, reason below"
+                message = (
+                    f"no method recommended: the model of {method.name} fails in calib identify for the reason below"
+                )
                 notes.append(Note(message))
                 break
     return list(dict.fromkeys(notes))

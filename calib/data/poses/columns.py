@@ -109,7 +109,7 @@ class Sheet:
             self.table.index(name)
         for name, unit in self.options.units.items():
             if name not in (*names, *UNIT_GROUPS, *self.table.header) and not _TARGET.fullmatch(name):
-                message = f"the options state unit {unit} for '{name}', which is not a column"
+                message = f"the options state unit {unit} for '{name}', which is not a column: correct [units]"
                 self.fail(message + suggestion(name, (*names, *UNIT_GROUPS)), name)
 
     def find_joints(self, joints: Sequence[str]) -> tuple[str, ...]:

@@ -141,7 +141,9 @@ def _check_reference(motion: Motion) -> None:
     if not finite.all():
         joint = int(np.argmin(finite))
         refuse_data(
-            motion.file, f"the reference of {motion.joint_names[joint]} (joint {joint + 1}) is not finite everywhere"
+            motion.file,
+            f"the reference of {motion.joint_names[joint]} (joint {joint + 1}) is not finite everywhere: cut those "
+            "samples out",
         )
     for j in np.flatnonzero(np.ptp(motion.q, axis=0) > 1e-3):
         reference = motion.q_ref[:, j]

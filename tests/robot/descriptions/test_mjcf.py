@@ -109,7 +109,7 @@ OTHER = '<geom size="0.1"/><body name="c"><joint name="k" axis="0 1 0"/><geom si
         (one_joint(TWO, OTHER, '<equality><connect body1="c" anchor="0 0 1"/></equality>'), r"closes a loop"),
         (
             one_joint(TWO, OTHER, '<equality><joint joint1="k" joint2="j" polycoef="0 1 2 0 0"/></equality>'),
-            r"equality 'number 1' of 'k' is no straight line",
+            r"equality 'number 1' of 'k' is not linear",
         ),
         (
             one_joint(TWO, OTHER, '<tendon><fixed><joint joint="k" coef="1"/></fixed></tendon>'),
