@@ -101,7 +101,7 @@ def test_what_a_controller_does_not_take_is_named(tmp_path):
     with pytest.raises(UsageError, match="the operator presses a key"):
         program_files(path, tmp_path / "cal", "ros2", ProgramSettings(output=1))
     (tmp_path / "empty.src").write_text("DEF empty()\n; PTP {A1 1,A2 2,A3 3,A4 4,A5 5,A6 6}\nPTP {A1 5}\nEND\n")
-    with pytest.raises(MeasurementError, match="has no targets"):
+    with pytest.raises(MeasurementError, match="has no complete targets"):
         read_program(tmp_path / "empty.src")
     (tmp_path / "rail.csv").write_text("rail [mm],joint1 [deg]\n1,2\n")
     with pytest.raises(UsageError, match=r"not lengths: rail"):
