@@ -201,7 +201,7 @@ def require_usable(settings: IdentificationSettings, method: Method) -> Identifi
     if method.needs_controller and settings.loop is None:
         refuse_option(
             option,
-            "state the controller in the options file, [loop] controller = … (calib formats "
+            "needs the closed loop: state [loop] controller = … in the options file (calib formats "
             "identify-options), and log or state the reference; from q and torque alone use wls or irls",
         )
     if not method.takes(rows):
@@ -215,6 +215,7 @@ def require_usable(settings: IdentificationSettings, method: Method) -> Identifi
         supporting = [name for name, candidate in METHODS.items() if candidate.takes_models]
         refuse_option(
             option,
-            f"standard friction only, not friction = '{friction}'; methods that support it: {', '.join(supporting)}",
+            f"supports standard friction only, not friction = '{friction}'; methods that support it: "
+            f"{', '.join(supporting)}",
         )
     return settings

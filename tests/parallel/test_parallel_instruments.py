@@ -147,7 +147,7 @@ def test_what_no_simulation_can_follow_is_said():
         ({"method": "cloe", "rows": "power"}, r"rows = 'power' is not supported"),
         ({"method": "gtls"}, "differentiates the torques of a serial arm"),
         ({"rows": "power"}, r"rows = 'power' is not supported; methods that support it: ols, wls"),
-        ({"loop": None}, r"needs a \[loop\]|state the controller"),
+        ({"loop": None}, r"needs a \[loop\]|needs the closed loop"),
     ],
 )
 def test_methods_and_rows_without_a_simulation_are_refused(more, said):

@@ -528,7 +528,7 @@ def write(commands: Commands, out: Path, partial: bool = False) -> Path:
         head = f"{targets.file}: {lost} of {count} targets are not reached; nothing was written"
         message = "\n  ".join([head, *_unreached(commands)])
         if lost != count:
-            message += "\nwith partial (--partial), all other rows are written and these stay empty"
+            message += "\nwith partial (--partial), all other rows are written, and those above stay empty"
         raise UsageError(message)
 
     q = commands.q / (targets.factors or 1.0)

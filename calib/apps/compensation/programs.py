@@ -106,7 +106,7 @@ class CompensatedProgram:
             head = f"{self.program.path}: {len(lost)} of {count} targets are not reached; nothing was written"
             message = "\n  ".join([head, *lost])
             if len(lost) != count:
-                message += "\nwith --partial, the others are written and these stay unchanged"
+                message += "\nwith --partial, all other targets are written, and those above stay unchanged"
             raise UsageError(message)
         return files.write(out, self.program.rewritten(self.values))
 

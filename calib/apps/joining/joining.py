@@ -49,7 +49,7 @@ from calib.units import TIMES
 
 METHODS = ("name", "time", "row", "geometry", "motion")
 # what the files need for each of the methods without motion
-REQUIREMENTS = ("both files need a column of names (name, pose, id …)", "of times (t)", "as many rows", "give --robot")
+REQUIREMENTS = ("both files need names (a column name, pose, id …)", "times (column t)", "as many rows", "give --robot")
 
 # Thresholds are our choice.
 # distance of two readings of one pose [m], where nothing is known of their scatter

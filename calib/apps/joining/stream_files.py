@@ -176,7 +176,7 @@ def read_stream(path: Path, kind: Kind) -> Stream:
         reasons = _reasons(dropped)
         if reasons:
             message += f" ({reasons})"
-        refuse_data(path, f"{message}: is it a stream, and one recording?")
+        refuse_data(path, f"{message}: is it a stream, recorded without interruption?")
     parts = [part for part in parts if len(part.t)]
     t = np.concatenate([part.t for part in parts])
     values = np.concatenate([part.values for part in parts])

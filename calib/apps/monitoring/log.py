@@ -146,7 +146,7 @@ class RobotLog(ChartedResult, ReportedResult, WithoutVerdict):
         ]
         panels = [
             Panel(errors_drawn, "error on unseen poses [mm]", xnames=dates),
-            Panel(motion_drawn, "the tool moved since the one before [mm]", xnames=dates),
+            Panel(motion_drawn, "motion of the tool since the last calibration [mm]", xnames=dates),
         ]
         return {"log": Chart(panels, 2.6, 2)}
 

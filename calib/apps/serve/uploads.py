@@ -55,7 +55,7 @@ def targets(session: Session, kind: str, names: list[str]) -> list[Path]:
         message = f"{name}: expected {' or '.join(suffixes)}; nothing was stored"
         require(name.lower().endswith(suffixes), message, UsageError)
         for start in other_prefixes:
-            message = f"{name}: names with '{start}' belong to another upload of this page; use that, or rename it"
+            message = f"{name}: files named '{start}…' have another upload on this page; use that, or rename it"
             require(not name.lower().startswith(start), message, UsageError)
         stored_name = name
         if not name.lower().startswith(prefix):

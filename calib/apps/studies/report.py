@@ -311,7 +311,7 @@ def make_page(
     blocks: list[Block] = [overview(conditions)]
     if len(conditions) > 1:
         blocks.append(torque_table(conditions))
-    blocks += [Text("How that was decided", RULE), Text("Figures", MEANING)]
+    blocks += [Text("How methods are recommended", RULE), Text("Figures", MEANING)]
     sections = [Section("", blocks)]
     all_columns = [column.name for column in COLUMNS]
     for summary in conditions:

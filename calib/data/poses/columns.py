@@ -286,7 +286,9 @@ def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
     if not orientation:
         sheet.fail("kind 'pose' needs qx qy qz qw, r11 to r33, or rx ry rz; the header has none of them")
     if len(positions) > 1:
-        sheet.fail("kind 'pose' allows one target per row, but positions are numbered", positions[1][0])
+        sheet.fail(
+            "kind 'pose' allows one target per row, but positions are numbered: use kind 'position'", positions[1][0]
+        )
     if orientation[0] not in ("qx", "r11"):
         meaning = f" as {sheet.options.euler}" if len(orientation) == 3 else ""
         notes = (*notes, f"the orientation is read from {', '.join(orientation)}{meaning}")

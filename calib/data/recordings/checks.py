@@ -334,7 +334,7 @@ def _still(recording: Recording) -> list[str]:
     notes = []
     for j in np.flatnonzero(stands):
         fixed = np.ptp(recording.q[:, j]) < BOUNDS.min_travel
-        travel = "is one number" if fixed else f"moves less than {LIMITS.min_travel:g}"
+        travel = "is constant" if fixed else f"moves less than {LIMITS.min_travel:g}"
         effort = f", and so is its {recording.kind}" if dead[j] else ""
         notes.append(
             f"{recording.joint_names[j]} never moves (its position {travel}{effort}): parameters that only its "

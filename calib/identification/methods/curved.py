@@ -75,7 +75,9 @@ class Curved:
         except ArithmeticError:
             slope = np.full(len(u), np.nan)
         if not np.isfinite([self.value(b), *slope]).all():
-            self._refuse(f"no finite value or derivative at {self._at(u)}; state it so that it has one there")
+            self._refuse(
+                f"no finite value or derivative at {self._at(u)}; restate the constraint so that it has one there"
+            )
         if self.stated:
             self._compare(u, slope)
         return np.asarray(slope @ self.rows)
@@ -144,7 +146,7 @@ def make_curved(constraint: CurvedConstraint, row: Callable[[Mapping[str, float]
     name = constraint.name or (f"h({', '.join(names)}) >= 0" if callable(h) else h)
     location = f"[constraints] curved '{name}'"
     if callable(h) == (constraint.slope is None):
-        refuse_option(location, "'slope' states the derivatives of a function; a formula has its own")
+        refuse_option(location, "a function needs 'slope' (its derivatives), a formula has none: add or remove it")
     if callable(h) and constraint.slope is not None:
         function = _called(h, location, 1)
         count = len(names)

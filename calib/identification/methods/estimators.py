@@ -112,7 +112,8 @@ def _null_direction(
     if k:
         if np.abs(np.diag(upper)[:k]).min() <= 1e-12 * np.abs(upper).max():
             raise Unidentifiable(
-                "the exact columns are dependent; choose base columns", [names[c] for c in exact if c < len(names)]
+                "the columns without noise are linearly dependent; choose base columns",
+                [names[c] for c in exact if c < len(names)],
             )
         coupled = upper[:k, k:] @ direction[noisy]
         direction[exact] = -scipy.linalg.solve_triangular(upper[:k, :k], coupled)

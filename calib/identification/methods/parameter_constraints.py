@@ -182,7 +182,7 @@ def make_constraints(
         low, high = weighted_sum.limits
         label = weighted_sum.name or " + ".join(f"{weight:g} {name}" for name, weight in weighted_sum.weights.items())
         twice = weighted_sum.equal is not None and (weighted_sum.least, weighted_sum.most) != (None, None)
-        require(not twice, f"{location}: 'equal' excludes 'least' and 'most': remove it or them", UsageError)
+        require(not twice, f"{location}: 'equal' cannot be combined with 'least' or 'most': remove one", UsageError)
         if low > high or not (np.isfinite(low) or np.isfinite(high)):
             refuse_option(f"{location} ({label})", "expected equal, or least <= most")
         requests.append((label, weighted_sum.weights, low, high))

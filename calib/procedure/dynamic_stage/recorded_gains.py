@@ -147,7 +147,8 @@ def _relative(chain: Chain, options: IdentifyOptions, currents: Sequence[tuple[s
         else:
             printed.append(f"{gain:.4g} ± {sigma:.2g}")
     notes = [
-        f"torques are {without_gains(unit)}; gains relative to it {', '.join(printed)}; for N m give gains, "
+        f"torques are {without_gains(unit)}; gains by joint, relative to that reference: {', '.join(printed)}; for N "
+        "m give gains, "
         "or [gain_identification] with a payload of known mass"
     ]
     if gains.own:
@@ -174,7 +175,7 @@ def _identify(
     base = find_base(model, cases, chain_states(chain, model, settings.seed))
     missing = [name for name in known_values if name not in [model.names[k] for k in base.kept]]
     if missing:
-        raise UsageError(f"'{missing[0]}' is not separately identifiable here; was the payload attached?")
+        raise UsageError(f"'{missing[0]}' is not separately identifiable from these runs; was the payload attached?")
     decimator = common_decimator(cases, settings)
     rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
     tau = first_fit(rows)[1]

@@ -292,7 +292,10 @@ def excited_model(
     identifiable = {model.names[k].removeprefix(name) for k in base.kept for name in STANDARD}
     lost = [label for label in _payloads(model) if label not in identifiable]
     if lost:
-        notes = (*notes, f"payload {', '.join(lost)}: not identifiable from these loads; run others, too: --load none")
+        notes = (
+            *notes,
+            f"payload {', '.join(lost)}: not identifiable from these loads; add another load, such as --load none",
+        )
     return ExcitedModel(
         smooth=LoadCases(smooth, base, loads),
         exact=LoadCases(model, base, loads),

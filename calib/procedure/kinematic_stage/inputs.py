@@ -361,7 +361,7 @@ def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeas
     order = np.random.default_rng(seed).permutation(count)
     if held_count == 0 or held_count == count:
         raise MeasurementError(
-            f"a hold-out share of {share:g} gives {held_count} of {count} poses; change it", block.file
+            f"a hold-out share of {share:g} gives {held_count} of {count} poses; state another share", block.file
         )
     held_out = np.isin(pose, order[count - held_count :])
     return take(block, np.flatnonzero(~held_out)), take(block, np.flatnonzero(held_out))

@@ -160,7 +160,7 @@ def _pairs(path: Path, chain: Chain, source: Path | None) -> ParsedTable:
     ignored = [list(pair) for pair in pairs if {*pair} <= links]
     if pairs and not ignored:
         raise UsageError(
-            f"{path}: none of its {len(pairs)} disabled pairs is of links of {chain.name}, as {shown(pairs[:1])}: "
-            "is it another robot's?"
+            f"{path}: none of its {len(pairs)} disabled pairs has links of {chain.name}, e.g. {shown(pairs[:1])}: "
+            "is it for another robot?"
         )
     return {"ignored": ignored}

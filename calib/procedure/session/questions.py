@@ -256,7 +256,7 @@ def cell_tables(**answers: str | Sequence[str] | None) -> dict[str, object]:
             value = read(text, texts) if name in ("carried", "stands") else read(text)
         except ValueError as error:
             option = "obstacle" if name == "obstacles" else name.replace("_", "-")
-            raise UsageError(f"--{option} {text}: {error}, or unknown") from None
+            raise UsageError(f"--{option} {text}: {error}, or the word unknown") from None
         if key:
             tables[table] = tables.get(table, {}) | {key: value}
         else:

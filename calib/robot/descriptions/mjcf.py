@@ -185,7 +185,7 @@ class _Tree:
             tied |= {follower, leader}
         for k in range(model.nwrap):
             if model.wrap_type[k] != int(self.mj.mjtWrap.mjWRAP_JOINT) or int(model.wrap_objid[k]) not in tied:
-                refuse_robot(self.where, "a tendon moves it, which a serial arm does not have; remove it from the file")
+                refuse_robot(self.where, "a tendon moves joints of the arm, which is not supported; remove the tendon")
         return mimics
 
 

@@ -40,7 +40,7 @@ class DescriptionReader(Protocol):
 
 DESCRIPTIONS: Point[DescriptionReader] = Point("descriptions", "readers of robots' descriptions that are no URDF")
 
-XACRO = "this is a xacro file; name it so (robot.urdf.xacro)"
+XACRO = "this is a xacro file; rename it to end in .xacro (robot.urdf.xacro)"
 _DECLARED = re.compile(rb"""^\s*<\?xml[^>]*?encoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")
 
 _ATTRIBUTE = re.compile(rb"""\s+([^\s=/>]+)\s*=\s*("[^"]*"|'[^']*')""")

@@ -301,7 +301,7 @@ def _matching_path(tree: UrdfTree, nominal: Chain) -> list[JointTag]:
         refuse_robot(
             tree.where,
             f"its joints to '{tip}' are {', '.join(actuated)}; the nominal robot '{nominal.name}' has "
-            f"{', '.join(names)}: not the same arm",
+            f"{', '.join(names)}: give the URDF of the nominal robot",
         )
     return path[path.index(moving[0]) :]
 

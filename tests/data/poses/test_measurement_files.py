@@ -199,7 +199,7 @@ def test_socket_groups_and_pairs_by_options(write, good):
     assert block.links == ((0, 2, 0.05),)
     block = read(path, FileOptions(groups=("day",), kind="sockets"))
     assert block.group_names[:4] == ("0/0", "0/1", "0/2", "1/0")
-    assert any("group of one row" in note for note in block.notes)
+    assert any("measured in one row only" in note for note in block.notes)
 
 
 def test_where_keeps_rows_and_their_numbers(write, good):

@@ -254,7 +254,7 @@ def test_what_is_odd_is_noted(archive, series):
     still = series["q"].copy()
     still[:, 1] = 0.7
     (note,) = read_recording(archive(q=still, dq=None), ROBOT).notes
-    assert note.startswith("b never moves (its position is one number)")
+    assert note.startswith("b never moves (its position is constant)")
     notes = read_recording(archive(tau=-series["tau"]), ROBOT).notes
     assert any("is their sign reversed?" in note for note in notes)
     notes = read_recording(archive(tau=series["tau"] / 80), ROBOT).notes

@@ -103,7 +103,7 @@ class ToolPart(ChangePart):
             RecordColumn("poses", lambda motion: f"{len(motion.q)}"),
             RecordColumn("median mm", _median_mm),
             RecordColumn("rms mm", lambda motion: f"{1e3 * motion.rms:.3g}"),
-            RecordColumn("σ of that mm", lambda motion: f"{1e3 * motion.expected:.2g}"),
+            RecordColumn("expected from σ mm", lambda motion: f"{1e3 * motion.expected:.2g}"),
             RecordColumn("worst mm", _worst_mm),
             RecordColumn("median mrad", _median_mrad),
             RecordColumn("worst mrad", _worst_mrad),
@@ -130,7 +130,7 @@ class ToolPart(ChangePart):
             lines.append(f"{beginning}, {worst}, {turns}")
         if change.changed:
             joint, joint_rms = max(change.by_joint, key=itemgetter(1))
-            lines.append(f"most of it comes from {joint}: {1e3 * joint_rms:.3g} mm rms")
+            lines.append(f"most of this motion comes from {joint}: {1e3 * joint_rms:.3g} mm rms")
         return lines
 
     def _worst_joints(self, motion: ToolMotion) -> str:

@@ -121,7 +121,7 @@ class TorquePart(ChangePart):
             RecordColumn("motion", "{0.motion}", number=False),
             RecordColumn("torque of", "{0.name}", number=False),
             RecordColumn(f"change rms {unit}", "{0.change:.3g}"),
-            RecordColumn("σ of that", "{0.expected:.2g}"),
+            RecordColumn("expected from σ", "{0.expected:.2g}"),
             RecordColumn("worst", "{0.worst:.3g}"),
             RecordColumn("torque rms", "{0.torque:.3g}"),
         ]
