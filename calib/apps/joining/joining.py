@@ -99,7 +99,7 @@ def join(
         robot = load_calibrated(robot, base, tip)
     if by == "motion":
         if robot is None:
-            raise UsageError("by motion the clocks are found from the nominal arm's path: give --robot")
+            raise UsageError("joining by motion needs the nominal arm's path: give --robot")
         return join_streams(joints_file, points_file, robot.complete)
     if is_program(joints_file):
         joint_table = joints_table(joints_file)

@@ -267,7 +267,9 @@ class SamplingReport:
         kind, times = self.clock.kind, self.clock.times
         if kind != "stamps":
             share = self.clock.roughness[kind]
-            lines.append(f"samples are dated by the clock '{kind}': positions are {1 / share:.3g} times smoother")
+            lines.append(
+                f"samples are dated by clock '{kind}': positions are {1 / share:.3g} times smoother than by stamps"
+            )
         if kind == "counted" and abs(times - 1.0) > APART:
             lines.append(f"step from measured velocities / step from stamps: {times:.4g}")
         if self.repeated:

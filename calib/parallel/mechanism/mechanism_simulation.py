@@ -140,7 +140,9 @@ class ParallelPlant:
         drives[:, 4] = 1.0
         # Without terms the slice is of all parameters, and the loop has no round.
         for term, value in zip(model.terms, model.spread(values)[-len(model.terms) :]):
-            require(term.shape in SHAPES, f"term '{term.name}' ({term.shape}) cannot be simulated", UsageError)
+            require(
+                term.shape in SHAPES, f"term '{term.name}' ({term.shape}) cannot be simulated: remove it", UsageError
+            )
             drives[term.joint, SHAPES[term.shape]] += value
             if term.shape == "sign":
                 require(
