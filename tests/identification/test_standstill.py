@@ -195,7 +195,7 @@ def test_intervals_have_two_widths_and_hold_in_both():
 
 
 def test_cut_slow_is_refused_with_what_replaced_it():
-    with pytest.raises(UsageError, match="cut_slow: each standstill of a joint now counts once"):
+    with pytest.raises(UsageError, match="cut_slow: standing rows are no longer cut"):
         parse_options({"cut_slow": True})
 
 
