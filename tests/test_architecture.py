@@ -130,7 +130,8 @@ def test_experiment_design_imports_no_calib(package):
         assert not {"calib", "poses", "trajectories"} & {module.split(".")[0] for module in modules}, path
 
 
-def test_the_walker_sees_every_form_of_import():
+def test_walker_sees_every_form_of_import():
+    """The walker sees every form of import."""
     inside = "def f():\n    from calib import cli\n    try: import poses.select as s\n    finally: import rerun\n"
     source = inside + "from ..robot import chain\nfrom . import columns\n"
     names = {name for name, _ in imported(source, ("calib", "estimation"))}
@@ -180,7 +181,7 @@ def test_a_folder_holds_at_most_14_modules():
     assert {folder.name: count for folder, count in counted.items() if count > 14} == {}
 
 
-def test_every_folder_with_modules_is_a_package():
+def test_folders_with_modules_are_packages():
     """Installation finds packages by their ``__init__.py``: a folder without one would be left out."""
     folders = {path.parent for path in SOURCES}
     assert [str(folder) for folder in folders if not (folder / "__init__.py").exists()] == []
@@ -198,7 +199,8 @@ def test_the_command_line_starts_light(loaded):
     assert "calib.cli" in loaded["command line"] and heavy & loaded["command line"] == set()
 
 
-def test_every_file_of_the_packages_is_installed():
+def test_every_package_file_is_installed():
+    """Every file of the packages is installed."""
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
     installed = {
         path
@@ -210,7 +212,7 @@ def test_every_file_of_the_packages_is_installed():
     assert {path for path in there if path.suffix != ".py" and "__pycache__" not in path.parts} == installed
 
 
-def test_the_rungs_of_a_ladder_are_named_in_its_table_alone():
+def test_rungs_are_named_in_table_alone():
     """Help, schemas and examples of files list the rungs from there."""
     ladders = {"calib/data/poses/__init__.py": MODELS[4:], "calib/dynamics/shapes.py": tuple(STEPS)}
     for table, rungs in ladders.items():

@@ -44,17 +44,19 @@ def found() -> dict[str, Any]:
         ("caller's limit", [[2], [2]]),
     ],
 )  # fmt: skip
-def test_a_call_or_a_generators_step_has_one_thread_and_gives_back_the_callers(found, when, threads):
+def test_call_has_one_thread_and_restores(found, when, threads):
     """Calls that overlap have one until the last ends; a caller's own limit counts."""
     assert found[when] == threads
 
 
 @pytest.mark.parametrize("name", ["OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"])
-def test_a_variable_of_the_environment_counts(name):
+def test_environment_variable_counts(name):
+    """A variable of the environment that asks for threads counts."""
     chosen = json.loads(python(blas_threads.__file__, **{name: "3"}))
     assert chosen["call"] == [3] and chosen["steps"] == [[3]] * 3
 
 
-def test_a_command_has_one_unless_the_environment_says_more():
+def test_command_has_one_unless_told_more():
+    """A command has one thread unless the environment says more."""
     assert python("-c", COMMAND, "formats") == "[1]"
     assert python("-c", COMMAND, "formats", OPENBLAS_NUM_THREADS="2") == "[2]"

@@ -39,7 +39,8 @@ def chosen() -> tuple[str, str]:
     return os.environ["NUMBA_CACHE_DIR"], os.environ["MPLCONFIGDIR"]
 
 
-def test_both_get_a_folder_of_this_user_alone_that_stays(read_only: Path) -> None:
+def test_both_caches_get_a_lasting_folder(read_only: Path) -> None:
+    """Both caches get a folder of this user alone, and it stays."""
     numba, matplotlib = chosen()
     assert Path(numba).is_dir() and Path(matplotlib).is_dir() and numba != matplotlib
     parent = Path(numba).parent
@@ -48,7 +49,8 @@ def test_both_get_a_folder_of_this_user_alone_that_stays(read_only: Path) -> Non
     assert chosen() == (numba, matplotlib)
 
 
-def test_code_that_others_may_have_written_is_not_loaded(read_only: Path) -> None:
+def test_code_others_may_write_is_not_loaded(read_only: Path) -> None:
+    """Code that others may have written is not loaded."""
     public = read_only / caches.FOLDER.format(user=os.getuid())
     public.mkdir()
     public.chmod(0o777)

@@ -49,7 +49,7 @@ def places(table: Any, above: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]
 @pytest.mark.parametrize("kind", FILES)
 @FEW
 @given(data=st.data())
-def test_a_wrong_value_anywhere_is_a_complaint_of_one_line(kind: str, data: st.DataObject) -> None:
+def test_wrong_value_is_one_complaint_line(kind: str, data: st.DataObject) -> None:
     """What is read, its JSON schema accepts, too: an editor shows no error where there is none."""
     base, read = FILES[kind]
     table = copy.deepcopy(base)
@@ -81,7 +81,8 @@ def validator(kind: str) -> Draft202012Validator:
 
 
 @pytest.mark.parametrize("kind", SCHEMAS)
-def test_the_json_schema_knows_every_key_and_refuses_others(kind: str, capsys: pytest.CaptureFixture) -> None:
+def test_schema_has_the_known_keys_alone(kind: str, capsys: pytest.CaptureFixture) -> None:
+    """The JSON schema knows every key, and refuses others."""
     assert run(["formats", kind, "--schema"]) == 0
     found = json.loads(capsys.readouterr().out, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
     assert found["$schema"] == "https://json-schema.org/draft/2020-12/schema"
@@ -99,7 +100,8 @@ def test_the_json_schema_knows_every_key_and_refuses_others(kind: str, capsys: p
         assert list(ours.iter_errors(base | {f"{key}z": base[key]})), key
 
 
-def test_a_topic_without_schema_says_which_have_one(capsys: pytest.CaptureFixture) -> None:
+def test_topic_without_schema_lists_others(capsys: pytest.CaptureFixture) -> None:
+    """A topic without a schema says which topics have one."""
     assert run(["formats", "moveit", "--schema"]) == 2
     assert "available for options, identify-options" in capsys.readouterr().err
 
@@ -190,7 +192,8 @@ def test_identify_options_that_cannot_be(table: dict[str, Any], words: str) -> N
         identify_options.parse_options(table)
 
 
-def test_what_holds_for_every_recording_is_handed_down_to_one() -> None:
+def test_common_values_reach_each_recording() -> None:
+    """What holds for every recording is handed down to each of them."""
     table = {"filter": {"band": 5.0, "order": 2}, "gains": [1.0], "files": {"a.npz": {"filter": {"band": 7.0}}}}
     found = identify_options.parse_options(table)
     own = found.file_settings("x/a.npz")
@@ -201,7 +204,8 @@ def test_what_holds_for_every_recording_is_handed_down_to_one() -> None:
 
 @FEW
 @given(st.text(max_size=40) | st.text("0123456789.+-*/() pie degmm", max_size=60))
-def test_an_expression_is_a_number_or_a_complaint(text: str) -> None:
+def test_expression_is_number_or_complaint(text: str) -> None:
+    """An expression is a number or a complaint."""
     try:
         assert not math.isnan(number(text, "x", "angle"))
     except CalibError as error:

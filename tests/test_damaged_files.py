@@ -213,7 +213,8 @@ ODD_MEMBERS = (
 
 
 @pytest.mark.parametrize("name", ["t", "q", "tau", "joint_names", "use_range", "drive_gain", "rate", "periods"])
-def test_an_archive_with_an_odd_member_is_read_or_refused(name: str, tmp_path: Path) -> None:
+def test_archive_with_odd_member_is_handled(name: str, tmp_path: Path) -> None:
+    """An archive with an odd member is read or refused."""
     series = {key: value[:200] for key, value in planted.series(0).items()}
     for odd in ODD_MEMBERS:
         read_odd(series, name, odd, tmp_path)

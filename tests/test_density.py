@@ -85,7 +85,8 @@ def test_the_measure_counts_what_it_says():
     assert density_of([text]) == expected
 
 
-def test_figures_are_lowered_and_never_raised():
+def test_figures_fall_and_never_rise():
+    """Figures are lowered and never raised."""
     text = '[density.calib]\nfmt_skip = 40\n\n[tokens]\n"calib" = 1_000\n"calib/data" = 1_000\n'
     assert lowered(text, "tokens", '"calib"', 1_001) == text
     assert lowered(text, "tokens", '"calib/data"', 900) == text.replace('"calib/data" = 1_000', '"calib/data" = 900')

@@ -38,7 +38,8 @@ def test_every_offer_loads():
         assert Point(name, "").all(), name
 
 
-def test_every_point_is_declared_once_with_its_type():
+def test_points_are_declared_once_with_type():
+    """Every point is declared once with its type."""
     sources = [path.read_text(encoding="utf-8") for path in (ROOT / "calib").rglob("*.py")]
     declared = [match for source in sources for match in DECLARED.finditer(source)]
     assert Counter(match["name"] for match in declared) == Counter(POINTS) and len(POINTS) <= 10

@@ -106,13 +106,15 @@ def refused_or_done(code: int, command: tuple[str, ...], room: Path, capsys: pyt
 
 
 @pytest.mark.parametrize("name", HOSTILE)
-def test_a_hostile_input_is_refused_in_one_line_or_read(name: str, room: Path, capsys) -> None:
+def test_hostile_input_is_refused_or_read(name: str, room: Path, capsys) -> None:
+    """A hostile input is refused in one line, or read."""
     spoil, command, code = HOSTILE[name]
     spoil(room)
     refused_or_done(code, command, room, capsys)
 
 
-def test_what_is_damaged_in_a_session_is_named(room: Path, capsys) -> None:
+def test_session_damage_is_named(room: Path, capsys) -> None:
+    """What is damaged in a session is named."""
     assert run("new", "cell", "--robot", "arm.urdf", "--instrument", "tracker", "--geometry-only") == 0
     edited("cell/session.toml", "fit = 40", "fit = 8")(room)
     assert run("next", "cell") == 0

@@ -62,7 +62,8 @@ def fitted(points, tmp_path_factory) -> Path:
     return out
 
 
-def test_view_shows_the_errors_of_what_measures_no_position(pointless, tmp_path):
+def test_view_shows_errors_without_positions(pointless, tmp_path):
+    """View shows the errors of what measures no position."""
     pytest.importorskip("rerun")
     kind, out = pointless
     shown = viewer.write(out, tmp_path / "a.rrd")
@@ -73,14 +74,16 @@ def test_view_shows_the_errors_of_what_measures_no_position(pointless, tmp_path)
     assert rms is not None and f"{rms.rms:.3f} mm calibrated" in viewer.about(shown)
 
 
-def test_a_certificate_names_what_was_measured(pointless):
+def test_certificate_names_what_was_measured(pointless):
+    """A certificate names what was measured."""
     kind, out = pointless
     page = (out / "certificate.html").read_text()
     words = {"sockets": "socket scatter", "plane": "plane distance"}.get(kind, "distance")
     assert f"{words}, rms" in page and "position, rms" not in page
 
 
-def test_view_keeps_rows_of_another_station_apart(points, tmp_path):
+def test_view_separates_rows_by_station(points, tmp_path):
+    """View separates the rows of another station."""
     settings = calib.FitSettings(model="geometry", refit_frames=True)
     fit = calib.fit_geometry("tx40", points[0], settings, validate=points[1])
     shown = scene.read(fit.save(tmp_path / "fit", plots=False))
@@ -91,7 +94,8 @@ def test_view_keeps_rows_of_another_station_apart(points, tmp_path):
     assert all(np.sqrt(np.mean(sizes**2)) < 10 * SIGMA for sizes in errors)
 
 
-def test_calibrations_that_estimated_nothing_of_the_arm_are_not_tested(points, tmp_path):
+def test_unestimated_arms_are_not_tested(points, tmp_path):
+    """Calibrations that estimated nothing of the arm are not tested."""
     frames = calib.fit_geometry("tx40", points[0], calib.FitSettings(model="frames"))
     found = calib.diff(frames, frames)
     assert found.geometry is not None and found.geometry.freedom == 0 and found.geometry.probability == 1.0
@@ -101,7 +105,8 @@ def test_calibrations_that_estimated_nothing_of_the_arm_are_not_tested(points, t
     assert "not tested" not in calib.diff(geometry, geometry).verdict.reason
 
 
-def test_a_fit_on_a_fit_knows_where_the_nominal_robot_stands(points, fitted, tmp_path):
+def test_fit_on_fit_knows_nominal_placement(points, fitted, tmp_path):
+    """A fit on a fit knows where the nominal robot stands."""
     again = calib.fit_geometry(fitted, points[1], calib.FitSettings(model="geometry")).save(tmp_path / "b", plots=False)
     alone = calib.fit_geometry("tx40", points[1], calib.FitSettings(model="geometry")).save(tmp_path / "c", plots=False)
     placed, expected = (joint_commands.read(each).nominal for each in (again, alone))
@@ -110,7 +115,8 @@ def test_a_fit_on_a_fit_knows_where_the_nominal_robot_stands(points, fitted, tmp
         assert own == pytest.approx(other, abs=1e-6)
 
 
-def test_a_compliance_takes_its_masses_from_its_folder(truth, tmp_path):
+def test_compliance_takes_masses_from_folder(truth, tmp_path):
+    """A compliance takes its masses from its folder."""
     stiff = load("lwr4plus")
     soft = replace(truth, chain=planted.perturb(stiff, 4))
     rows = planted.measure(soft, "position", 150, 1, sigma=SIGMA)
@@ -141,13 +147,15 @@ def powered(tmp_path_factory):
     return robot, model, model.save(folder / "model")
 
 
-def test_the_power_of_two_recordings_tells_the_payload(powered):
+def test_power_tells_payload(powered):
+    """The power of two recordings tells the payload."""
     found = powered[1].estimate
     mass = found.names.index("Mload")
     assert abs(found.values[mass] - planted_motion.PAYLOAD[9]) < 4 * found.sigma[mass] < 0.2 * planted_motion.PAYLOAD[9]
 
 
-def test_a_model_of_power_is_a_result_like_others(powered, tmp_path):
+def test_power_model_is_a_result_like_others(powered, tmp_path):
+    """A model of power is a result like others."""
     robot, model, folder = powered
     copy = pickle.loads(pickle.dumps(model))
     assert copy.found.settings.torque_rows == POWER
@@ -160,7 +168,8 @@ def test_a_model_of_power_is_a_result_like_others(powered, tmp_path):
         calib.design_excitation(robot, calib.ExcitationSettings(period=4.0, starts=1), after=folder)
 
 
-def test_a_friction_step_without_terms_is_said(tmp_path):
+def test_friction_step_without_terms_is_said(tmp_path):
+    """A friction step without terms is said."""
     robot = description.write(tmp_path / "planted.toml", planted_motion.arm())
     log = planted_motion.write(tmp_path, "a.npz", 0)
     model = calib.identify_dynamics(robot, log, friction="coupling")
@@ -179,7 +188,8 @@ def test_a_motion_knows_its_robot(tmp_path):
         joint_commands.read(folder)
 
 
-def test_programs_of_motions_are_written_where_asked(tmp_path, capsys):
+def test_motion_programs_go_where_asked(tmp_path, capsys):
+    """Programs of motions are written where asked."""
     planned = calib.plan_motion("tx40", np.array([[0.0] * 6, [0.3] * 6]), calib.PlanSettings(rate=250.0))
     folder = planned.save(tmp_path / "plan", plots=False)
     for name in ("m_rsi.csv", "m.krl"):
@@ -191,7 +201,8 @@ def test_programs_of_motions_are_written_where_asked(tmp_path, capsys):
     assert "give a list of poses, a program, or the folder of a motion" in capsys.readouterr().err
 
 
-def test_a_parallel_fit_has_the_pages_and_figures_of_an_arms(tmp_path):
+def test_parallel_fit_has_pages_of_arm_fits(tmp_path):
+    """A parallel fit has the pages and figures of an arm's fit."""
     robot, rng = find("fivebar"), np.random.default_rng(0)
     assert robot is not None
     parameters = loop_parameters(robot.mechanism)
@@ -218,14 +229,15 @@ class _Table:
 
 
 @pytest.mark.parametrize("given", [[], [1.0], [1.0, 2.0, 3.0]])
-def test_lists_of_fixed_length_are_refused_by_their_length(given):
+def test_wrong_list_length_is_refused(given):
+    """Lists of fixed length are refused by their length."""
     with pytest.raises(UsageError, match=r"t\.toml: sigmas: expected a list of 2 values"):
         parse(_Table, {"sigmas": given}, "t.toml")
 
 
 @pytest.mark.parametrize("arm", ["tx40", "ur5"])
 @pytest.mark.parametrize("kind", ["position", *KINDS])
-def test_computed_measurements_of_any_kind_are_fitted(kind, arm):
+def test_computed_measurements_are_fitted(kind, arm):
     """Exact but for the rounding of a file: what they do not determine lies in valleys too narrow to follow."""
     cell = planted.cell(planted.perturb(load(arm), 1, 3e-4, 5e-4), 2)
     rows = planted.measure(cell, kind, 90, 5)

@@ -79,7 +79,8 @@ def run_odd(command: str, data: st.DataObject, place: Path) -> None:
 @pytest.mark.parametrize("command", FAST)
 @settings(max_examples=4, deadline=None, derandomize=True, suppress_health_check=CHECKS)
 @given(data=st.data())
-def test_an_odd_option_is_a_complaint_or_a_result(command: str, data: st.DataObject, place: Path) -> None:
+def test_odd_option_is_complaint_or_result(command: str, data: st.DataObject, place: Path) -> None:
+    """An odd option is a complaint or a result."""
     run_odd(command, data, place)
 
 

@@ -173,7 +173,8 @@ RECIPES = {"finding": FINDING, "an option": OPTION, "an effect of the geometry":
 
 
 @pytest.mark.parametrize("title", RECIPES)
-def test_a_recipe_names_the_files_that_change(title: str) -> None:
+def test_recipe_names_files_that_change(title: str) -> None:
+    """A recipe names the files that change."""
     text = " ".join(recipe(title).split())
     changed = {edit.path for edit in RECIPES[title]}
     assert len(changed) <= 2

@@ -51,7 +51,8 @@ def test_nested_content_becomes_values():
         ({"both": [1, 2.5]}, r"^both\[1\]: .*found 2.5"),
     ],
 )
-def test_what_does_not_belong_is_named_with_its_place(change, words):
+def test_misplaced_record_entry_is_located(change, words):
+    """What does not belong into a record is named with its place."""
     with pytest.raises(ValueError, match=words):
         read_record(Outer, GOOD | change)
 
@@ -67,7 +68,8 @@ class Series:
         return len(self.values)
 
 
-def test_a_record_is_read_back_as_it_was_written(tmp_path):
+def test_record_survives_writing_and_reading(tmp_path):
+    """A record is read back as it was written."""
     kept = {"a": Series(np.array([1.0 / 3.0, np.nan]), np.inf), "b": Series(np.zeros((2, 1)), 2.0)}
     path = files.write_json(tmp_path / "r.json", kept)
     found = read_json(path, kind=Mapping[str, Series])
@@ -77,7 +79,8 @@ def test_a_record_is_read_back_as_it_was_written(tmp_path):
     assert np.isnan(found["a"].error) and found["b"].error == 2.0
 
 
-def test_a_number_that_may_not_be_nan_is_not_written(tmp_path):
+def test_forbidden_nan_is_not_written(tmp_path):
+    """A number that may not be NaN is not written."""
     with pytest.raises(CalibError, match=r"a\.share"):
         files.write_json(tmp_path / "r.json", {"a": Series(np.zeros(1), 0.0, np.nan)})
     assert not list(tmp_path.iterdir())

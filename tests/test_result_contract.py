@@ -273,7 +273,8 @@ def test_a_stored_result_keeps_the_protocol(kind, results, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["fit", "identification"])
-def test_a_delivery_states_the_results_verdict(kind, results, capsys):
+def test_delivery_states_verdict_of_result(kind, results, capsys):
+    """A delivery states the result's verdict."""
     assert cli.run(["deliver", str(results / kind), "--for", "ur"]) in (0, 1)
     assert f"verdict {open_result(results / kind).verdict.level}: " in capsys.readouterr().out
 
@@ -295,14 +296,16 @@ def test_classes_are_of_kinds_that_exist():
         *(ParallelFit, RobotChange, DriftFound, RobotLog, FleetReport),
     ],
 )
-def test_a_result_in_memory_keeps_the_protocol(made):
+def test_result_in_memory_keeps_protocol(made):
+    """A result in memory keeps the protocol."""
     members = ("kind", "verdict", "save", "figures", "tables", "scene")
     assert issubclass(made, Kept) and made.kind in KINDS
     fields = getattr(made, "__dataclass_fields__", {})
     assert [name for name in members if not hasattr(made, name) and name not in fields] == []
 
 
-def test_a_result_in_memory_has_what_its_folder_has(results):
+def test_result_in_memory_equals_folder(results):
+    """A result in memory has what its folder has."""
     plan = calib.plan_motion("tx40", np.loadtxt(results / "waypoints.csv", delimiter=",", skiprows=1))
     stored = open_result(results / "plan")
     assert isinstance(plan, calib.Result) and plan.kind is stored.kind is BY_NAME["plan"]

@@ -13,7 +13,8 @@ from calib.errors import CalibError, RobotError, UsageError
 from calib.folders import METRICS, check_target, write_staged
 
 
-def test_nothing_is_written_over_what_is_read_or_not_ours(tmp_path: Path) -> None:
+def test_read_or_foreign_files_stay(tmp_path: Path) -> None:
+    """Nothing is written over what is read, or is not ours."""
     out = tmp_path / "out"
     check_target(out, (METRICS, "a.csv"), (METRICS,), "fit", [tmp_path / "log.npz"])
     out.mkdir()
@@ -26,7 +27,8 @@ def test_nothing_is_written_over_what_is_read_or_not_ours(tmp_path: Path) -> Non
         check_target(out, (METRICS, "a.csv"), (METRICS,), "fit", [f"{out / 'a.csv'}@0:9"])
 
 
-def test_leftovers_of_killed_runs_go_and_those_of_living_ones_stay(tmp_path: Path) -> None:
+def test_only_killed_runs_leftovers_go(tmp_path: Path) -> None:
+    """Leftovers of killed runs go, and those of living ones stay."""
     gone = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
     dead, living = int(gone.stdout), os.getpid()
     kept = {".out.b.7.x3.part", f".out.{living}.x2.part", f".a.csv.{living}.x.part"}
@@ -38,7 +40,8 @@ def test_leftovers_of_killed_runs_go_and_those_of_living_ones_stay(tmp_path: Pat
     assert (tmp_path / "out" / METRICS).exists()
 
 
-def test_figures_of_others_stay_and_stale_ones_of_ours_go(tmp_path: Path) -> None:
+def test_stale_figures_go_unless_of_others(tmp_path: Path) -> None:
+    """Figures of others stay, and stale ones of ours go."""
     ours = (METRICS, "plot_torque_[0-9]*.png", "plot_map.png")
     for name in (METRICS, "plot_mine.png", "plot_torque_12.png", "plot_map.png", "plot_torque_mine.png"):
         (tmp_path / name).touch()
@@ -50,7 +53,8 @@ def test_figures_of_others_stay_and_stale_ones_of_ours_go(tmp_path: Path) -> Non
         check_target(tmp_path, ours, (METRICS,), "fit")
 
 
-def test_links_that_lead_nowhere_are_no_targets(tmp_path: Path) -> None:
+def test_dangling_links_are_no_targets(tmp_path: Path) -> None:
+    """Links that lead nowhere are no targets."""
     for name, aim in (("dangling", "absent"), ("loop", "loop")):
         (tmp_path / name).symlink_to(tmp_path / aim)
         with pytest.raises(UsageError, match=name):
@@ -59,7 +63,8 @@ def test_links_that_lead_nowhere_are_no_targets(tmp_path: Path) -> None:
         files.check_target(tmp_path / ("x" * 300), [])
 
 
-def test_a_covariance_comes_back_by_names_of_any_kind(tmp_path: Path) -> None:
+def test_covariance_returns_by_any_names(tmp_path: Path) -> None:
+    """A covariance comes back by names of any kind."""
     names = ("plain", 'day1, "left"\nof it', "ü")
     matrix = np.diag([1.0, 2.0, 3.0])
     path = tmp_path / folders.COVARIANCE
@@ -71,7 +76,8 @@ def test_a_covariance_comes_back_by_names_of_any_kind(tmp_path: Path) -> None:
         folders.read_covariance(tmp_path)
 
 
-def test_files_written_together_appear_together(tmp_path: Path) -> None:
+def test_grouped_files_appear_together(tmp_path: Path) -> None:
+    """Files written together appear together."""
     with pytest.raises(CalibError, match="nothing was changed"), files.together():
         files.write(tmp_path / "a.csv", "1")
         (tmp_path / "file").touch()
@@ -85,7 +91,8 @@ def test_files_written_together_appear_together(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("mark", [METRICS, "session.toml"])
-def test_the_folder_of_another_result_or_a_session_is_refused(mark, tmp_path: Path) -> None:
+def test_foreign_result_folder_is_refused(mark, tmp_path: Path) -> None:
+    """The folder of another result or a session is refused."""
     (tmp_path / mark).touch()
     with pytest.raises(UsageError, match=f"contains {mark}"):
         check_target(tmp_path, ("robot.urdf",), (), "export")

@@ -56,7 +56,8 @@ def test_a_results_name_has_one_home() -> None:
     assert set(homes) == set(RESULTS)
 
 
-def test_folders_are_recognised_by_names_that_are_written() -> None:
+def test_folders_are_recognised_by_names() -> None:
+    """Folders are recognised by names that are written."""
     homes = set().union(*(paths(source) for source in SOURCES if source.name != KINDS))
     for kind in result_kinds.KINDS:
         for marks in kind.marks:

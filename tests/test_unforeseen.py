@@ -36,7 +36,8 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (BrokenPipeError(32, "Broken pipe"), 141, ""),
     ],
 )
-def test_whatever_happens_is_one_line_and_a_code(error, code, words, monkeypatch, capsys, tmp_path) -> None:
+def test_any_failure_is_one_line_and_a_code(error, code, words, monkeypatch, capsys, tmp_path) -> None:
+    """Whatever happens, the command ends with one line and a code."""
     monkeypatch.setattr("calib.procedure.formats.describe", failing(error))
     assert cli.run(["formats", "mdh"]) == code
     said = capsys.readouterr().err
@@ -49,7 +50,8 @@ def test_whatever_happens_is_one_line_and_a_code(error, code, words, monkeypatch
         assert "in describe" in text and "numpy " in text
 
 
-def test_lack_of_memory_behind_a_library_that_cannot_be_loaded_names_the_largest_file(tmp_path) -> None:
+def test_lack_of_memory_names_largest_file(tmp_path) -> None:
+    """Lack of memory behind a library that cannot be loaded names the largest file."""
     (tmp_path / "log.npz").write_bytes(b"x" * 900)
     (tmp_path / "arm.urdf").write_bytes(b"x" * 90)
     try:
@@ -62,14 +64,16 @@ def test_lack_of_memory_behind_a_library_that_cannot_be_loaded_names_the_largest
     assert code == 2 and words.startswith("log.npz: not enough memory: libllvmlite.so: failed to map segment")
 
 
-def test_reports_readme_and_project_name_one_tracker() -> None:
+def test_one_tracker_is_named_everywhere() -> None:
+    """Reports, README and project name one tracker."""
     urls = tomllib.loads((ROOT / "pyproject.toml").read_text()).get("project", {}).get("urls", {})
     assert urls.get("Issues", bug_reports.TRACKER) == bug_reports.TRACKER
     assert bug_reports.TRACKER in " ".join((ROOT / "README.md").read_text().replace("`", "").split())
     assert bug_reports.TRACKER in bug_reports.report(ValueError("x"), ["fit"])
 
 
-def test_a_report_goes_elsewhere_where_the_folder_cannot_be_written(monkeypatch, capsys, tmp_path) -> None:
+def test_report_avoids_unwritable_folder(monkeypatch, capsys, tmp_path) -> None:
+    """A report goes elsewhere where the folder cannot be written."""
     other = tmp_path / "other"
     other.mkdir()
     gone = tmp_path / "gone"
@@ -87,11 +91,13 @@ def test_debug_shows_the_traceback(monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("word", ["", "m\udcff.csv"])
-def test_a_word_that_is_empty_or_no_utf8_is_refused(word, capsys) -> None:
+def test_empty_or_non_utf8_word_is_refused(word, capsys) -> None:
+    """A word that is empty or no UTF-8 is refused."""
     assert cli.run(["formats", word]) == 2 and "formats" in capsys.readouterr().err
 
 
-def test_warnings_of_others_are_kept_and_ours_pass() -> None:
+def test_foreign_warnings_are_held_back() -> None:
+    """Warnings of others are held back, and ours pass."""
     import warnings
 
     from calib.errors import CalibWarning, quiet

@@ -29,7 +29,7 @@ def test_a_folder_with_a_users_modules(tmp_path: Path):
     assert done.returncode == 0, done.stderr
 
 
-def test_no_module_of_calib_is_imported_by_two_names(tmp_path: Path):
+def test_no_calib_module_has_two_names(tmp_path: Path):
     """In a checkout the folders poses and trajectories can be imported by accident, too, with other classes."""
     script = (
         "import sys; from calib.cli import run; run(['new', 'cell', '--robot', 'tx40', '--instrument', 'tracker']); "

@@ -93,7 +93,8 @@ def test_one_run_at_a_time(crews: dict[str, Workers], where: str) -> None:
 
 
 @EVERYWHERE
-def test_of_a_million_tasks_few_are_taken_at_once(crews: dict[str, Workers], where: str) -> None:
+def test_few_of_many_tasks_are_begun_at_once(crews: dict[str, Workers], where: str) -> None:
+    """Of a million tasks few are taken at once."""
     taken = []
     tasks = (taken.append(x) or x for x in range(1_000_000))
     assert len(list(islice(crews[where].completed(square, tasks), 5))) == 5
@@ -101,7 +102,7 @@ def test_of_a_million_tasks_few_are_taken_at_once(crews: dict[str, Workers], whe
 
 
 @IN_PARALLEL
-def test_results_that_wait_for_their_turn_are_few(crews: dict[str, Workers], where: str) -> None:
+def test_few_results_wait_for_their_turn(crews: dict[str, Workers], where: str) -> None:
     """256 of them, and two that are begun."""
     taken = []
     results = crews[where].map(late_first, (taken.append(x) or x for x in range(600)))
@@ -117,12 +118,14 @@ def test_workers_use_one_thread_each(crews: dict[str, Workers], where: str) -> N
 
 
 @pytest.mark.slow
-def test_a_task_whose_process_is_killed_is_tried_again(crews: dict[str, Workers], tmp_path: Path) -> None:
+def test_task_of_killed_process_runs_again(crews: dict[str, Workers], tmp_path: Path) -> None:
+    """A task whose process is killed is tried again."""
     tasks = [tmp_path / f"{x}" for x in range(3)]
     assert sorted(crews["processes"].completed(die_at_first, tasks)) == [(x, f"{x}") for x in range(3)]
 
 
-def test_a_task_lost_for_good_costs_no_other_result(crews: dict[str, Workers]) -> None:
+def test_lost_task_costs_no_other_result(crews: dict[str, Workers]) -> None:
+    """A task lost for good costs no other result."""
     found = dict(crews["processes"].completed(die_of_two, range(5)))
     lost = found.pop(2)
     assert found == {0: 0, 1: 1, 3: 3, 4: 4}
@@ -135,7 +138,8 @@ def crew_of(*answers: tuple[int, int | None, TaskLost | None]) -> Workers:
     return Workers(lambda function, tasks, near: (answer for answer, _ in zip(answers, tasks)))  # type: ignore[arg-type]
 
 
-def test_in_order_a_lost_task_is_raised_in_its_place_and_a_search_leaves_it_out() -> None:
+def test_lost_task_is_raised_or_left_out() -> None:
+    """In order, a lost task is raised in its place, and a search leaves it out."""
     crew = crew_of((1, None, TaskLost("task 2 is lost", 1)), (2, 4, None), (0, 0, None))
     results = crew.map(square, range(3))
     assert next(results) == 0
@@ -146,7 +150,8 @@ def test_in_order_a_lost_task_is_raised_in_its_place_and_a_search_leaves_it_out(
     assert [one.number for one in lost] == [1]
 
 
-def test_a_search_that_loses_every_task_says_so() -> None:
+def test_search_losing_every_task_says_so() -> None:
+    """A search that loses every task says so."""
     crew = crew_of(*((number, None, TaskLost(f"task {number + 1} is lost")) for number in range(3)))
     with pytest.raises(TaskLost, match="task 3"):
         list(crew.map_without([])(square, range(3)))
@@ -154,7 +159,7 @@ def test_a_search_that_loses_every_task_says_so() -> None:
 
 
 @pytest.mark.slow
-def test_a_cluster_loses_workers_and_no_result(tmp_path: Path) -> None:
+def test_cluster_loses_workers_and_no_result(tmp_path: Path) -> None:
     """Of two workers one is killed in the middle; then a task kills whoever runs it, twice; then the scheduler goes."""
     with dask_cluster.running(tmp_path, workers=2, failures=1) as cluster, workers(cluster.address) as crew:
         pids = {worker.pid: worker for worker in cluster.workers}
@@ -186,7 +191,8 @@ def test_a_cluster_loses_workers_and_no_result(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_cluster_without_workers_is_not_waited_for_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_empty_cluster_is_not_awaited_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cluster without workers is not waited for long."""
     monkeypatch.setattr("calib.workers.cluster.NO_WORKERS", 1.0)
     alone = dask_cluster.running(tmp_path, workers=0)
     complaint = pytest.raises(CalibError, match="has had no workers for 1 s")
@@ -209,7 +215,8 @@ def test_workers_are_a_number_or_an_address(wrong: str) -> None:
         pass
 
 
-def test_this_process_takes_one_task_at_a_time() -> None:
+def test_this_process_takes_one_task_at_once() -> None:
+    """This process takes one task at a time."""
     taken = []
     with workers("1") as crew:
         results = crew.map(square, (taken.append(x) or x for x in (2, 3)))
@@ -261,7 +268,7 @@ def assert_gone(pids: list[int]) -> None:
 @pytest.mark.parametrize(
     ("run", "hit"), [("map", "group"), pytest.param("completed", "parent", marks=pytest.mark.slow), ("map", "workers")]
 )
-def test_after_ctrl_c_tasks_under_way_hand_back_what_they_have(tmp_path: Path, run: str, hit: str) -> None:
+def test_ctrl_c_hands_back_tasks_under_way(tmp_path: Path, run: str, hit: str) -> None:
     """Whether the terminal's group gets it, this process alone, or its workers before it; no further task begins."""
     running = script(tmp_path, run)
     pids = pids_in(tmp_path)
@@ -273,7 +280,7 @@ def test_after_ctrl_c_tasks_under_way_hand_back_what_they_have(tmp_path: Path, r
     assert_gone(pids)
 
 
-def test_a_second_signal_while_a_task_ends_shows_nothing_of_the_workers(tmp_path: Path) -> None:
+def test_second_signal_hides_worker_output(tmp_path: Path) -> None:
     """A terminal sends its own beside the parent's."""
     running = script(tmp_path, task="slow_to_say")
     for pid in pids_in(tmp_path):
@@ -294,13 +301,15 @@ def test_no_process_outlives_its_parent(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_script_that_starts_itself_again_is_told(tmp_path: Path) -> None:
+def test_self_starting_script_is_told(tmp_path: Path) -> None:
+    """A script that starts itself again is told."""
     running = script(tmp_path, guard="True")
     _, err = running.communicate(timeout=SECONDS)
     assert "CalibError: worker processes die at start" in err and "lacks if __name__" in err
 
 
-def test_what_is_nearly_done_survives_one_interrupt_and_not_two() -> None:
+def test_nearly_done_survives_one_interrupt() -> None:
+    """What is nearly done survives one interrupt, and not two."""
     before = signal.getsignal(signal.SIGINT)
     with finishing():
         os.kill(os.getpid(), signal.SIGINT)

@@ -1,4 +1,4 @@
-"""Commands for geometry: select, fit; and export."""
+"""Commands for geometry: select and fit; and export."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated

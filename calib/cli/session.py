@@ -1,4 +1,4 @@
-"""Commands of the guided session: new, next, status, redo; formats and explain."""
+"""Commands of the guided session: new, next, status, redo; and formats and explain."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -59,7 +59,11 @@ def new(
 
 
 def _completed(answers: Answers) -> Answers:
-    """Return the answers completed by questions at a terminal."""
+    """Return the answers completed by questions at a terminal.
+
+    Raises:
+        UsageError: if answers are missing and there is no terminal.
+    """
     import sys
 
     from calib.procedure.session.questions import QUESTIONS, with_answer
@@ -118,12 +122,15 @@ def explain(code: Annotated[str | None, typer.Argument(autocompletion=codes)] = 
 
 
 @command(app, "Start", "next")
-def next_step(folder: Folder, plots: bool = True) -> None:
+def next_step(folder: Folder, pick: Annotated[int | None, typer.Option(min=1)] = None, plots: bool = True) -> None:
     """Continue a session, then print what to do at the robot.
 
     Example: calib next cell
+
+    Args:
+        pick: number of a motion in 6-excitation/training/front.csv, which becomes the training motion
     """
-    _go_on(folder, "next", plots=plots)
+    _go_on(folder, "next", plots=plots, pick=pick or 0)
 
 
 @command(app, "Start")
@@ -151,13 +158,15 @@ def status(folder: Folder) -> None:
     say(*commands.noted(folder))
 
 
-def _go_on(folder: Path, command: str, step: str = "", plots: bool = True) -> None:
+def _go_on(folder: Path, command: str, step: str = "", plots: bool = True, pick: int = 0) -> None:
     from calib.procedure.session import commands
 
     arguments: list[object] = [command, folder]
     if step:
         arguments.append(step)
+    if pick:
+        arguments += ["--pick", pick]
     with reporting() as (say, progress):
-        stop = commands.go_on(folder, say, progress, command_line(*arguments), step, plots)
+        stop = commands.go_on(folder, say, progress, command_line(*arguments), step, plots, pick)
     say(*stop.lines)
     exit_failed(stop.verdict)

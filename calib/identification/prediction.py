@@ -1,6 +1,7 @@
-"""An identified model as a predictor of torques.
+"""An identified model as a predictor of torques, and the errors of predicted torques.
 
-Errors of predicted torques: relative errors, moving and standing separately, and the share above the band.
+The errors are relative errors, separately for moving and standing joints, and the share of the torque above the
+identification band.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ MAX_LAGS = 30
 
 @dataclass(frozen=True, eq=False)
 class RelativeErrors:
-    """Relative errors of predicted torques [%].
+    """Relative errors of predicted torques τ̂ [%].
 
     Attributes:
         total: 100 ‖τ - τ̂‖_F / ‖τ‖_F over all rows and samples.
@@ -45,7 +46,7 @@ class RelativeErrors:
 
 @dataclass(frozen=True, eq=False)
 class PredictionErrors:
-    """Prediction errors on one set of samples.
+    """Prediction errors on a set of samples.
 
     Attributes:
         relative_error_percent: relative errors of all rows together, and of each row.
@@ -59,7 +60,7 @@ class PredictionErrors:
 
     @property
     def total(self) -> float:
-        """Relative error of all rows [%]."""
+        """Relative error of all rows together [%]."""
         return self.relative_error_percent.total
 
     @property
@@ -73,11 +74,12 @@ class IntervalCoverage:
     """Share of the errors within a model's 95 % intervals, and share of samples outside its training range.
 
     Attributes:
-        coverage_percent, joints_percent: of all rows, and of each (rows,).
-        median: (rows,) half width of the intervals in motion in the torque's unit.
+        coverage_percent, joints_percent: share of errors within the intervals, over all rows, and of each row (rows,).
+        median: (rows,) median half width of the intervals in motion, in the torque's unit.
         samples: number of samples compared.
         extrapolated_percent: share of these samples outside the training range.
-        median_at_rest: (rows,) half width at rest, NaN where a joint does not stand; () in earlier versions.
+        median_at_rest: (rows,) median half width at rest; NaN for a joint that is never at rest; () in files of earlier
+            versions.
     """
 
     coverage_percent: float
@@ -90,20 +92,20 @@ class IntervalCoverage:
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Prediction errors of one case, a record of ``metrics.json``.
+    """Prediction errors of one recording, a record of ``metrics.json``.
 
     Attributes:
         raw: errors relative to the torque as recorded, at the full rate.
         filtered: errors with both torques low-passed to the identification band, at the full rate.
-        moving, standing: errors as `raw` for moving joints, and for standing ones.
-        above_band_percent: (rows,) share of the torque above the identification band, 100 ‖τ - τ_f‖ / ‖τ‖ [%]:
-            noise, ripple, elasticity; a lower bound of `raw` for any model with predictions in the band.
+        moving, standing: errors as in `raw`, but only of moving joints, and only of standing joints.
+        above_band_percent: (rows,) share of the torque above the identification band, 100 ‖τ - τ_f‖ / ‖τ‖ [%]: noise,
+            ripple, elasticity; a lower bound of `raw` for any model with predictions in the band.
         r_squared: (rows,) R² of the raw torque.
         whiteness: whiteness test of the residuals below the band, per row; None for series too short to test.
         rate: sampling rate of the series in the whiteness test, decimated to its band [Hz].
         motion_share: share of rows in motion; if small, the test covers mostly friction at rest.
-        evidence: False for a repeat of the training motion.
-        interval95: coverage of the 95 % intervals; None where the model states no intervals.
+        evidence: False for a repetition of the training motion.
+        interval95: coverage of the 95 % intervals; None if the model has no intervals.
     """
 
     raw: PredictionErrors
@@ -120,31 +122,34 @@ class Score:
 
     @property
     def stands(self) -> bool:
-        """Whether joints are at rest for a noticeable part of the recording, not only in reversals."""
+        """Whether joints are at rest for a noticeable part of the recording, in addition to reversals."""
         return self.motion_share < 1.0 - REST_SHARE and self.moving.samples > 0
 
     @property
     def judged(self) -> PredictionErrors:
-        """Errors that the verdict uses: in motion, as friction at rest is undetermined; all, if no joint is at rest."""
+        """Errors that the verdict uses: errors of moving joints, or all errors if no joint is at rest.
+
+        Friction at rest is undetermined, so that errors at rest do not count.
+        """
         return self.moving if self.stands else self.raw
 
     @property
     def at_rest(self) -> str:
-        """Error of joints at rest as text; empty if no joint is at rest."""
+        """Text on the error of joints at rest; empty if no joint is at rest."""
         return f"{self.standing.total:.2f} %" if self.stands else ""
 
 
 def relative_error_sigma(measured: np.ndarray, predicted: np.ndarray) -> float:
-    """Return the standard error of 100 ‖τ - τ̂‖ / ‖τ‖ [%]: a jackknife over blocks of time, as residuals are not white.
+    """Return the standard error of 100 ‖τ - τ̂‖ / ‖τ‖ [%], by a jackknife over blocks of time.
 
-    Efron and Tibshirani 1993, eq. 11.5, with a block left out in place of a sample (Künsch 1989); ten blocks are our
-    choice.
+    Blocks are used because residuals are autocorrelated (Efron and Tibshirani 1993, eq. 11.5, with blocks instead of
+    samples: Künsch 1989); ten blocks are our choice.
 
     Args:
         measured, predicted: (rows, N) torques.
 
     Returns:
-        NaN where there are fewer samples than two for each block, or no torque.
+        the standard error; NaN if there are fewer than two samples for each block, or no torque.
     """
     count = measured.shape[1]
     if count < 2 * JACKKNIFE_BLOCKS:
@@ -164,12 +169,13 @@ def relative_error_sigma(measured: np.ndarray, predicted: np.ndarray) -> float:
 def score(
     case: Case, predicted: np.ndarray, slow: float | tuple[float, ...] | None = None, apart: Sequence[int] = ()
 ) -> Score:
-    """Return the errors of a prediction (N, rows) at the full rate, without lost samples.
+    """Return the errors of predicted torques at the full rate; lost samples are ignored.
 
     Args:
         case: the recording.
         predicted: (N, rows) torques.
-        slow: speed below which a joint counts as at rest, see `calib.data.signals.motion.moving`.
+        slow: share of a joint's peak speed below which the joint counts as at rest, or one speed per joint [rad/s or
+            m/s]; None: the default of `calib.data.signals.motion.moving`.
         apart: rows in a different unit, excluded from totals.
     """
     motion = case.motion
@@ -213,11 +219,18 @@ def score(
 def _score_row(
     case: Case, predicted: np.ndarray, row: int, moves: np.ndarray
 ) -> tuple[np.ndarray, float, float, np.ndarray]:
-    """Return the sums of one torque row for a score; rows are processed one by one to save memory.
+    """Return the sums from which a torque row is scored; rows are processed one by one to save memory.
+
+    Args:
+        case: the recording.
+        predicted: (N,) predicted torque.
+        row: index of the row.
+        moves: (N,) mask of samples in which the joint moves.
 
     Returns:
-        (4, 3) Σ (τ - τ̂)², Σ τ² and their number of all samples, raw and in the band, of moving and of standing ones;
-        `Score.above_band_percent` and `Score.r_squared` of the row; (M,) the residual in the band, thinned.
+        an array (4, 3) of Σ (τ - τ̂)², Σ τ² and number of samples, for raw torques, filtered torques, moving joints,
+        and standing joints; `Score.above_band_percent` and `Score.r_squared` of the row; the filtered residual (M,),
+        decimated.
     """
     motion = case.motion
     valid = motion.weight > 0.5
@@ -239,14 +252,17 @@ def _score_row(
 
 
 def _sums(target: np.ndarray, residual: np.ndarray, selected: np.ndarray) -> tuple[float, float, float]:
-    """Return Σ (τ - τ̂)², Σ τ² and the number of some samples."""
+    """Return Σ (τ - τ̂)², Σ τ² and the number of samples, over the selected samples."""
     residual_square = float(np.sum(residual[selected] ** 2))
     target_square = float(np.sum(target[selected] ** 2))
     return residual_square, target_square, float(selected.sum())
 
 
 def _prediction_errors(sums: np.ndarray, apart: Sequence[int]) -> PredictionErrors:
-    """Return prediction errors from the sums (rows, 3) of the torque rows; the total excludes the rows `apart`."""
+    """Return prediction errors from sums (rows, 3) of the torque rows: Σ (τ - τ̂)², Σ τ² and number of samples.
+
+    The total excludes the rows `apart`.
+    """
     square, size, count = np.array(sums).T
     same_unit = ~np.isin(np.arange(len(square)), apart)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -260,7 +276,10 @@ def _prediction_errors(sums: np.ndarray, apart: Sequence[int]) -> PredictionErro
 
 
 def _whiteness(residual: np.ndarray, segment: np.ndarray) -> tuple[Whiteness | None, ...]:
-    """Return the whiteness tests of the longest segment of the decimated residuals (M, rows)."""
+    """Return the whiteness test of each row of decimated residuals (M, rows), in the longest segment.
+
+    The test is None for a row with too few samples or without variation.
+    """
     tests: list[Whiteness | None] = []
     for column in residual[longest(segment)].T:
         if len(column) > MIN_WHITENESS_SAMPLES and np.ptp(column) > 0.0:
@@ -279,15 +298,16 @@ class Dynamics(Frozen, Generic[Model]):
 
     Attributes:
         model: bodies and drive terms, or another model that is linear in its parameters.
-        values: (p,) of all standard parameters and terms; regrouped parameters have base values, the others
-            zero, so that single ones may not be physically consistent (`calib.dynamics.base.to_standard`).
+        values: (p,) values of all standard parameters and drive terms. Kept parameters have the base values and
+            regrouped ones are zero, so that single bodies may be physically inconsistent
+            (`calib.dynamics.base.to_standard`).
     """
 
     model: Model
     values: np.ndarray
 
     def transmitted(self: Dynamics[IdentificationModel], case: Case) -> np.ndarray:
-        """Return the torques (N, n) that the gears transmit to the bodies, for load-dependent friction."""
+        """Return the torques (N, n) that the gears transmit to the bodies along a case, for load-dependent friction."""
         q, v, a = case.links
         result = np.empty(case.motion.q.shape)
         for start in range(0, len(case.motion), BLOCK):
@@ -297,7 +317,10 @@ class Dynamics(Frozen, Generic[Model]):
 
 
 def predict(dynamics: Dynamics[RegressorModel], case: Case) -> np.ndarray:
-    """Return the torques of all rows at the full rate (N, rows) [N m or N]: W(q, v, a) · values, without W."""
+    """Return the predicted torques (N, rows) of a case at the full rate [N m or N]: W(q, v, a) · values.
+
+    W is not computed.
+    """
     model, motion = dynamics.model, case.motion
     states = segmented_states(model.columns, case)
     result = np.empty((len(motion), model.rows))

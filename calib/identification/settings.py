@@ -30,7 +30,7 @@ WEIGHTS = ("residuals", "repeats")
 @strict
 @dataclass(frozen=True)
 class Coupling:
-    """A gear whose motor turns with the sum of two joints (from 0), see `calib.dynamics.drives.coupled`."""
+    """A gear whose motor turns with the sum of two joints (from 0), as in `calib.dynamics.drives.coupled`."""
 
     joints: Annotated[tuple[JointNumber, JointNumber], Expect("two joint numbers, counted from 1")]
     label: Text = ""
@@ -46,13 +46,28 @@ class Payload:
 
     @property
     def parameters(self) -> tuple[float, ...] | None:
-        """Ten standard parameters in the tip's frame, as a point mass; None if mass or centre is unknown."""
+        """Ten standard parameters of a point mass, in the tip's frame [SI]; None if mass or centre is unknown."""
         if self.mass is None or self.com is None:
             return None
         x, y, z = self.com
         inertia = (y * y + z * z, -x * y, -x * z, x * x + z * z, -y * z, x * x + y * y)
         per_mass = (*inertia, x, y, z, 1.0)
         return tuple(self.mass * value for value in per_mass)
+
+    def __str__(self) -> str:
+        """Return the stated mass and centre of mass: ``3.28 kg at 0,0,0.05``, or that the mass is unknown."""
+        mass = "mass unknown" if self.mass is None else f"{self.mass:g} kg"
+        if self.com is None:
+            return mass
+        position = ",".join(f"{coordinate:g}" for coordinate in self.com)
+        return f"{mass} at {position}"
+
+
+def mass_as_payload(value: object) -> object:
+    """Return the table of a payload that is stated by its mass alone; other values as they are."""
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return {"mass": value}
+    return value
 
 
 @dataclass(frozen=True)
@@ -126,7 +141,11 @@ class IdentificationSettings(Choices):
 
 
 def make_model(chain: Chain, settings: IdentificationSettings) -> IdentificationModel:
-    """Return the model of a chain: bodies, payloads at the tip, and standard drive terms."""
+    """Return the model of a chain: bodies, payloads at the tip, and drive terms.
+
+    Raises:
+        UsageError: for settings that do not apply to this chain.
+    """
     require(
         not (settings.passive or settings.identical_legs),
         "passive, identical_legs: for parallel robots only; remove them",
@@ -171,7 +190,7 @@ def make_bodies(chain: Chain, settings: IdentificationSettings) -> Bodies:
 
 
 def _check_joints(n: int, settings: IdentificationSettings) -> None:
-    """Raise an error for couplings or terms of unknown joints, and for a joint coupled with itself."""
+    """Raise a UsageError for couplings or terms of unknown joints, and for a joint coupled with itself."""
     for coupling in settings.couplings:
         numbers = [joint + 1 for joint in coupling.joints]
         require(max(numbers) <= n, f"coupling: joints {numbers}: the robot has joints 1 to {n}", UsageError)
@@ -190,11 +209,11 @@ def _check_joints(n: int, settings: IdentificationSettings) -> None:
 
 
 def require_usable(settings: IdentificationSettings, method: Method) -> IdentificationSettings:
-    """Return the settings for a method, with what it makes of friction = "auto".
+    """Return the settings for a method, with friction = "auto" replaced by its meaning for this method.
 
     Raises:
-        UsageError: for a missing loop, torque rows that the method does not take, or richer friction; the message
-            names all methods that do.
+        UsageError: for a missing loop, or torque rows or friction that the method does not support; the message names
+            the methods that do.
     """
     option = f"method '{method.name}'"
     rows, friction = settings.torque_rows, settings.friction

@@ -113,7 +113,7 @@ def identify_parallel(
         on_read(inputs)
     model = model_of(mechanism, settings)
     identification: Any = identify_model(model, inputs.cases, settings, cad=model.known_parameters(), progress=progress)
-    noticed = [*_payloads(model, identification, inputs.cases)]
+    noticed = [*_payloads(model, inputs.cases)]
     if settings.identical_legs:
         noticed += legs_differ(identification, inputs.cases)
     if mechanism.robot.redundant:
@@ -276,16 +276,9 @@ def _encoders(mechanism: ClosedRobot, cases: Sequence[Case]) -> Iterator[Finding
             yield finding("passive-joints-unread", file=case.name, joints=unread_names)
 
 
-def _payloads(
-    model: ParallelModel, identification: Identification[RegressorModel], cases: Sequence[Case]
-) -> Iterator[Finding]:
-    """Yield findings on each payload: always or never attached in the recordings, or identified with negative mass."""
-    estimate = identification.fitted.estimate
-    masses = dict(zip(identification.base.names, zip(estimate.values, estimate.sigma)))
+def _payloads(model: ParallelModel, cases: Sequence[Case]) -> Iterator[Finding]:
+    """Yield findings on payloads that are attached in all recordings, or in none."""
     for label in model.payloads:
-        on = sum(label in case.carried for case in cases)
-        if on in (0, len(cases)):
-            yield finding("payload-always" if on else "payload-never", label=label)
-        elif f"M{label}" in masses:
-            mass, sigma = masses[f"M{label}"]
-            yield finding("payload-absent", label=label, mass=mass, sigma=sigma, sigmas=-mass / sigma)
+        count = sum(label in case.carried for case in cases)
+        if count in (0, len(cases)):
+            yield finding("payload-always" if count else "payload-never", label=label)

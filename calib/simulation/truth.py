@@ -7,7 +7,7 @@ import numpy as np
 
 from calib.data.poses.measurements import Poses
 from calib.dynamics import base as bases
-from calib.dynamics.bodies import bodies_of, standard_parameters
+from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
 from calib.dynamics.idim import IdentificationModel
 from calib.dynamics.rigid_body import inverse_dynamics
 from calib.folders import EstimateRow
@@ -141,18 +141,35 @@ def share_within(true: Mapping[str, float], estimate: Sequence[EstimateRow]) -> 
 
 
 def true_base(
-    model: IdentificationModel, cell: Cell, arm: MovingArm, seed: int, running: float = np.inf
+    model: IdentificationModel,
+    cell: Cell,
+    arm: MovingArm,
+    seed: int,
+    running: float = np.inf,
+    payloads: Mapping[str, Sequence[float]] | None = None,
 ) -> dict[str, float]:
     """Return the true base parameters of a model by name, regrouped on the true geometry.
 
     Friction is that of an arm in steady sliding that has moved for the time `running` [s], infinite for a warm one:
     friction with memory, all of it slipping, is Coulomb friction.
+
+    Args:
+        model: the identified model.
+        cell, arm: the virtual cell and its moving arm, without payload.
+        seed: seed of the samples that the regrouping is computed from.
+        running: time for which the arm has moved [s].
+        payloads: (10,) true standard parameters of the model's payloads in the tip's frame, by label.
     """
     parameters = _true_parameters(arm, running)
+    nominal_bodies, true_bodies = bodies_of(cell.nominal), bodies_of(arm.chain)
+    for label, values in (payloads or {}).items():
+        nominal_bodies = with_payload(nominal_bodies, np.asarray(cell.nominal.tail), label)
+        true_bodies = with_payload(true_bodies, np.asarray(arm.chain.tail), label)
+        parameters |= zip(true_bodies.names[-10:], values)
     names = {name for name in model.names if name in parameters}
     terms = tuple(term for term in model.terms if term.name in names)
-    nominal_model = replace(model, bodies=bodies_of(cell.nominal), terms=terms)
-    true_model = replace(model, bodies=bodies_of(arm.chain), terms=terms)
+    nominal_model = replace(model, bodies=nominal_bodies, terms=terms)
+    true_model = replace(model, bodies=true_bodies, terms=terms)
     lower, upper = arm.chain.sampling_limits()
     samples = bases.random_samples(nominal_model, seed=seed, lower=lower, upper=upper)
     base = bases.find(true_model, samples, nominal=nominal_model)

@@ -7,6 +7,7 @@ the first being measured by sensors behind the gears, the second by the motors, 
 that the nominal masses given to a calibration are wrong.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -139,6 +140,20 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors =
         unmodelled=unmodelled,
         sensors=sensors,
     )
+
+
+def carrying(arm: MovingArm, payload: Sequence[float]) -> MovingArm:
+    """Return the arm with a body at its flange, which its controller does not know.
+
+    Args:
+        arm: the moving arm.
+        payload: (10,) standard parameters in the tip's frame: inertia [kg m²], first moments [kg m], mass [kg].
+    """
+    parameters = arm.plant.parameters.copy()
+    last_link = slice(10 * (arm.chain.n - 1), 10 * arm.chain.n)
+    tail = np.asarray(arm.chain.tail)
+    parameters[last_link] += to_standard(tail @ from_standard(np.asarray(payload)) @ tail.T)
+    return replace(arm, plant=arm.plant.with_parameters(parameters))
 
 
 def sensed(robot: str) -> bool:

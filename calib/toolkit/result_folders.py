@@ -1,4 +1,4 @@
-"""Results: their folders, figures and verdicts, and how they are shown."""
+"""Results: their folders, figures and verdicts, and functions to display them."""
 
 from calib.api.dynamic import DynamicsModel
 from calib.api.kinematic import GeometryFit, Several, fit_geometry

@@ -1,5 +1,6 @@
-"""Sessions: a guided procedure in a folder, its steps, what they wait for and what they found."""
+"""Sessions: a guided procedure in a folder, with its steps, the files for which they wait, and their findings."""
 
+from calib.identification.settings import Payload
 from calib.procedure.session.certificate import pages as certificate_pages
 from calib.procedure.session.commands import COLOURS, asks, go_on, new_session
 from calib.procedure.session.drift import Trend, noise_of_difference, repeats, trends
@@ -20,6 +21,7 @@ from calib.procedure.session.folder import (
     read_state,
 )
 from calib.procedure.session.geometry_steps import chain_of, clear_staging, notes_on, read_measured
+from calib.procedure.session.questions import stated_payloads
 from calib.procedure.session.session_results import folders_of, position_errors, torque_error
 from calib.procedure.session.steps import DONE, KEPT, WAITING, run_next, steps_of
 from calib.procedure.session.steps import State as StepState
@@ -39,6 +41,7 @@ __all__ = [
     "UNSEEN",
     "WAITING",
     "WAYS",
+    "Payload",
     "Say",
     "Session",
     "StepState",
@@ -63,6 +66,7 @@ __all__ = [
     "read_state",
     "repeats",
     "run_next",
+    "stated_payloads",
     "step_states",
     "steps_of",
     "torque_error",

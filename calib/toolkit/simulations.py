@@ -1,4 +1,4 @@
-"""Simulation: virtual cells with known truth, arms in closed loop and their controllers."""
+"""Simulation: virtual cells with known truth, and arms in closed loop with their controllers."""
 
 from calib.identification.closed_loop.controllers import Reference
 from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun, feed_forward, simulate
@@ -21,7 +21,7 @@ from calib.simulation.known_robots import truth as known_truth
 from calib.simulation.truth import TRUTH, share_within, true_base
 from calib.simulation.truth import position_errors as true_position_errors
 from calib.simulation.truth import torque_errors as true_torque_errors
-from calib.simulation.virtual_arm import REST, MovingArm, moving_arm, play, record, sensed
+from calib.simulation.virtual_arm import REST, MovingArm, carrying, moving_arm, play, record, sensed
 from calib.simulation.virtual_cells import perturbed_cell, rigid, virtual_cell
 
 __all__ = [
@@ -37,6 +37,7 @@ __all__ = [
     "Sensing",
     "SimulatedInstrument",
     "SimulatedRun",
+    "carrying",
     "feed_forward",
     "known_plant",
     "known_truth",

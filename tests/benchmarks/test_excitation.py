@@ -78,7 +78,8 @@ def processor_time(call: Callable, rounds: int = 15) -> float:
 
 @pytest.mark.parametrize("harmonics", [5, 10])
 @pytest.mark.parametrize("samples", [200, 1000])
-def test_value_and_gradient_of_cond_against_differences(benchmark, harmonics, samples):
+def test_cond_gradient_against_differences(benchmark, harmonics, samples):
+    """Value and gradient of cond, against differences."""
     spot = problem(20.0, harmonics, samples, constrained=False)
     basis = spot.basis()
     x = random_start(problem(20.0, harmonics), basis, np.random.default_rng(0))

@@ -46,13 +46,15 @@ def test_counts_of_model_2():
 
 
 @pytest.mark.parametrize(("rows", "count"), [(LINK, 74), (BOTH, 102), (DRIVE, 28), (MOTOR, 79)])
-def test_counts_of_models_1_2_3_and_of_motor_torques_alone(rows, count):
+def test_parameter_counts_of_models(rows, count):
+    """Counts of models 1, 2, 3 and of motor torques alone."""
     assert found(rows).b == count
     assert MODELS == {1: LINK, 2: BOTH, 3: DRIVE}
 
 
 @pytest.mark.parametrize("case", [None, ()])
-def test_one_load_case_leaves_the_payload_in_the_links(case):
+def test_one_load_leaves_payload_in_links(case):
+    """One load case leaves the payload in the links."""
     assert base.find(arm(BOTH), loads=(case,)).b == 92
 
 
@@ -115,7 +117,8 @@ def test_regrouping_of_the_lwr():
 
 
 @pytest.mark.parametrize("rows", [MOTOR, BOTH])
-def test_base_parameters_predict_what_the_standard_ones_do(rows):
+def test_base_and_standard_predict_alike(rows):
+    """Base parameters predict what the standard ones do."""
     full, result = arm(rows), found(rows)
     chi = np.random.default_rng(0).normal(size=full.p)
     q, v, a = states(7)
@@ -127,7 +130,7 @@ def test_base_parameters_predict_what_the_standard_ones_do(rows):
     assert reduced.names == result.names and len(reduced.units) == result.b
 
 
-def test_inertia_matrix_survives_the_regrouping():
+def test_regrouping_keeps_inertia_matrix():
     """Dropped parameters at zero leave M(q) as it is: a base estimate can be simulated."""
     chain = load("tx40")
     full = IdentificationModel(bodies_of(chain))
@@ -149,7 +152,8 @@ def test_gradient_through_the_base_columns():
 
 
 @pytest.mark.parametrize("rows", [BOTH, MOTOR])
-def test_gradient_of_torques_through_the_base_columns(rows):
+def test_torque_gradient_by_base_columns(rows):
+    """Gradient of torques through the base columns."""
     reduced = base.BaseModel(arm(rows), found(rows))
     rng = np.random.default_rng(2)
     state, values = rng.normal(size=(3, 5, 7)), rng.normal(size=reduced.base.b)
@@ -158,7 +162,7 @@ def test_gradient_of_torques_through_the_base_columns(rows):
     assert np.allclose(of_torques, reduced.regressor_gradient(*state, push[:, :, None] * values), rtol=0, atol=1e-10)
 
 
-def test_regrouping_on_the_calibrated_geometry():
+def test_regrouping_on_calibrated_geometry():
     """The nominal columns stay, K moves (LWR4+ of the 2019 study, Table 2, rows 2 to 7), and it holds exactly."""
     nominal = IdentificationModel(bodies_of(load("lwr4plus")))
     calibrated = IdentificationModel(bodies_of(lwr4plus.arm(lwr4plus.table_2()[1])))
@@ -177,7 +181,7 @@ def test_regrouping_on_the_calibrated_geometry():
         assert name.endswith("R") == (" + " in line or " - " in line), line
 
 
-def test_a_leaning_axis_adds_weak_directions_and_the_remainder_says_what_they_carry():
+def test_leaning_axis_adds_weak_directions():
     """Axis 1 at 1 mrad from the vertical: rank 43 -> 45 by columns of 0.01 N m per kg m, left out and reported."""
     chain = load("lwr4plus")
     leaning = IdentificationModel(bodies_of(chain).with_gravity(9.81 * np.array([np.sin(1e-3), 0.0, -np.cos(1e-3)])))
@@ -192,7 +196,7 @@ def test_a_leaning_axis_adds_weak_directions_and_the_remainder_says_what_they_ca
 
 
 @pytest.mark.parametrize("robot", ["lwr4plus", "tx40", "ur5"])
-def test_choice_of_columns_does_not_hang_on_rounding(robot):
+def test_rounding_does_not_choose_columns(robot):
     """Other samples, other rounding: the same columns, the same K (so no BLAS build decides)."""
     full = from_chain(load(robot), "Ia Fv Fc off")
     first = base.find(full)
@@ -202,7 +206,8 @@ def test_choice_of_columns_does_not_hang_on_rounding(robot):
         assert np.allclose(other.transform, first.transform, rtol=0, atol=1e-9)
 
 
-def test_memory_stays_bounded_and_blocks_do_not_matter(monkeypatch):
+def test_memory_is_bounded_for_any_blocks(monkeypatch):
+    """Memory stays bounded, and blocks do not matter."""
     full = IdentificationModel(bodies_of(load("ur5")))
     samples = base.random_samples(full, 300)
     whole = base.r_factor(full, samples)
@@ -244,7 +249,8 @@ def test_prismatic_joints_and_tilted_gravity(name):
     assert "payload" not in name or len(moved) == 10
 
 
-def test_richer_friction_has_columns_of_its_own():
+def test_richer_friction_has_own_columns():
+    """Richer friction has columns of its own."""
     chain = load("ur5")
     rich = (
         friction.term("Fva2", "speed", 1),

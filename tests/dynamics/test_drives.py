@@ -28,7 +28,8 @@ def column(model, name, *motion, **more):
     return model.regressor(*motion, **more)[:, :, model.names.index(name)]
 
 
-def test_every_shape_has_a_compiled_code_of_its_own():
+def test_every_shape_has_its_compiled_code():
+    """Every shape has a compiled code of its own."""
     from calib.dynamics import shape_kernels
     from calib.dynamics.shapes import SHAPES
 
@@ -96,7 +97,7 @@ def test_terms_that_depend_on_more_say_so():
     assert np.allclose(found[:, 1], np.abs(torque[:, 1]) * v[:, 1], rtol=0, atol=1e-15)
 
 
-def test_stop_operator_is_coulomb_in_motion_and_a_spring_at_rest():
+def test_stop_operator_is_coulomb_and_spring():
     """Stiff within a width of the turning point, ±1 beyond; the loop closes and remembers its side."""
     model = IdentificationModel(bodies_of(TX40), (drives.term("Fp3.1", "presliding", 2, 0.1, 0.01),))
     x = np.concatenate([np.linspace(0, 1, 101), np.linspace(1, 0.95, 6)[1:], np.linspace(0.95, 0, 96)[1:]])

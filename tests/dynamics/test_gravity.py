@@ -31,6 +31,7 @@ def test_equal_to_pinocchio():
     assert gravity_torques(chain, q) == pytest.approx(expected, abs=1e-12)
 
 
-def test_an_arm_of_unknown_masses_has_no_gravity_torques():
+def test_no_gravity_torques_without_masses():
+    """An arm of unknown masses has no gravity torques."""
     with pytest.raises(RobotError, match="masses"):
         gravity_torques(load("ur5"), np.zeros((1, 6)))

@@ -19,7 +19,8 @@ def arm(rows):
 
 
 @pytest.mark.parametrize("rows", [MOTOR, LINK, BOTH])
-def test_the_rows_of_each_load_stand_one_after_the_other(rows):
+def test_rows_are_stacked_by_load(rows):
+    """The rows of each load stand one after the other."""
     model = arm(rows)
     cases = LoadCases(model, base.find(model, loads=RUNS), RUNS)
     q, v, a = np.random.default_rng(0).uniform(-1, 1, (3, 5, 7))
@@ -38,7 +39,8 @@ def test_the_rows_of_each_load_stand_one_after_the_other(rows):
 
 
 @pytest.mark.parametrize("rows", [MOTOR, BOTH])
-def test_derivatives_are_those_of_the_stacked_rows(rows):
+def test_derivatives_match_stacked_rows(rows):
+    """Derivatives are those of the stacked rows."""
     model, rng = arm(rows), np.random.default_rng(1)
     cases = LoadCases(model, base.find(model, loads=RUNS), RUNS)
     state = rng.uniform(-1, 1, (3, 4, 7))

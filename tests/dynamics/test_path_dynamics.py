@@ -51,7 +51,8 @@ def test_the_three_terms_are_pinocchios(chain, seen):
         np.testing.assert_allclose(ours, theirs, atol=1e-10)
 
 
-def test_the_torque_along_a_path_is_the_full_inverse_dynamics():
+def test_path_torque_is_inverse_dynamics():
+    """The torque along a path is the full inverse dynamics."""
     chain = load("lwr4plus")
     dynamics = of_standard(*driven(chain))
     q, slope, curvature = arms.states(chain.n, 30, seed=1)
@@ -67,7 +68,8 @@ def test_the_torque_along_a_path_is_the_full_inverse_dynamics():
     np.testing.assert_allclose(dynamics.rigid(q, v, a) + dynamics.friction(q, v, a), full, atol=1e-10)
 
 
-def test_richer_friction_depends_on_load_and_past_as_far_as_a_path_can_tell():
+def test_richer_friction_along_a_path():
+    """Richer friction depends on load and past as far as a path can tell."""
     chain = load("lwr4plus")
     model, values = driven(chain)
     model = model.with_terms(drives.term("Ft2", "load", 1, 0.01), drives.term("Fp4.1", "presliding", 3, 1e-3, 0.01))
@@ -79,7 +81,8 @@ def test_richer_friction_depends_on_load_and_past_as_far_as_a_path_can_tell():
     np.testing.assert_allclose(extra[:, 3], 0.0, atol=1e-12)  # slides on: Fc alone says what it costs
 
 
-def test_motor_torques_are_the_last_rows_of_a_model_with_joint_torque_sensors():
+def test_motor_torques_are_last_sensor_rows():
+    """Motor torques are the last rows of a model with joint torque sensors."""
     chain = load("lwr4plus")
     terms = drives.standard(["Ia Fvl Fcl Fvm Fcm"] * 7)
     values = np.concatenate([standard_parameters(chain), np.tile([0.5, 1.0, 2.0, 3.0, 4.0], 7)])
@@ -89,7 +92,8 @@ def test_motor_torques_are_the_last_rows_of_a_model_with_joint_torque_sensors():
     np.testing.assert_allclose(two.torque(q, v, a), one.torque(q, v, a), atol=1e-12)
 
 
-def test_rows_without_bodies_and_values_that_are_no_numbers_are_refused():
+def test_bodiless_rows_and_nan_are_refused():
+    """Rows without bodies and values that are no numbers are refused."""
     model, values = driven(load("lwr4plus"))
     with pytest.raises(CalibError, match="no bodies"):
         of_standard(IdentificationModel(model.bodies, model.terms, DRIVE), values[70:])

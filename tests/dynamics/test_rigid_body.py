@@ -32,7 +32,8 @@ def test_agrees_with_pinocchio(name):
     assert relative(rigid_body.regressor(bodies, q, v, a) @ chi, tau) < 1e-12
 
 
-def test_pinocchio_carries_bodies_without_mass():
+def test_pinocchio_carries_massless_bodies():
+    """Pinocchio carries bodies without mass."""
     chain = ARMS["lwr4plus"]
     rng = np.random.default_rng(1)
     chi = rng.normal(size=70)
@@ -80,7 +81,8 @@ def test_gradient_of_the_regressor(name):
     assert np.allclose(of_torques, of_rows, rtol=0, atol=1e-11)
 
 
-def test_gradient_of_torques_agrees_with_pinocchio_in_batch():
+def test_torque_gradient_is_pinocchios():
+    """The gradient of torques agrees with Pinocchio in batch."""
     import pinocchio as pin
 
     chain, chi = ARMS["lwr4plus"], physical(7).ravel()
@@ -110,7 +112,8 @@ def mimic() -> Chain:
     )
 
 
-def test_mimic_is_a_chain_of_three_with_tied_coordinates():
+def test_mimic_ties_coordinates_of_a_chain():
+    """A mimic joint is a chain of three with tied coordinates."""
     tied = bodies_of(mimic())
     free = Chain(
         "free",

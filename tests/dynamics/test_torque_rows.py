@@ -22,7 +22,7 @@ def states(count=7):
 
 
 @pytest.mark.parametrize("rows", ROWS.values(), ids=lambda rows: rows.name)
-def test_a_model_that_is_right_explains_the_target_of_its_rows(rows):
+def test_right_model_explains_row_targets(rows):
     """Of torques that motor and sensor would measure, whatever the rows: W chi = target."""
     q, v, a = states()
     chi = dict(zip(model(BOTH).names, np.random.default_rng(0).normal(size=model(BOTH).p)))
@@ -63,7 +63,8 @@ def test_power_is_a_model_of_one_row():
     assert np.allclose(POWER.target(torque, None, q, v)[:, 0], np.sum(v * torque, axis=1), rtol=0, atol=1e-12)
 
 
-def test_a_projection_of_stacked_rows_keeps_labels_and_refuses_slopes():
+def test_projected_rows_keep_labels():
+    """A projection of stacked rows keeps labels and refuses slopes."""
     first = np.eye(2 * N)[:2]
     rows = projected(
         "two", Projection(("x", "y"), ("N", "N"), lambda q, v: np.broadcast_to(first, (len(q), 2, 10))), BOTH

@@ -14,7 +14,8 @@ def dependent(seed: int, rows: int = 60, rank: int = 8, p: int = 13) -> np.ndarr
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_rank_is_the_planted_one_and_coefficients_reproduce_what_was_dropped(seed):
+def test_rank_and_coefficients_are_planted(seed):
+    """The rank is the planted one, and coefficients reproduce what was dropped."""
     matrix = dependent(seed)
     split = split_columns(matrix)
     assert (
@@ -27,7 +28,8 @@ def test_the_rank_is_the_planted_one_and_coefficients_reproduce_what_was_dropped
     assert split.gap > 1e8
 
 
-def test_full_rank_keeps_all_and_the_gap_is_infinite():
+def test_full_rank_has_an_infinite_gap():
+    """Full rank keeps all, and the gap is infinite."""
     split = split_columns(np.random.default_rng(0).normal(size=(30, 6)))
     assert split.rank == 6 and len(split.dropped) == 0 and split.gap == float("inf")
 
@@ -38,7 +40,8 @@ def test_fewer_rows_than_columns():
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_a_later_group_adds_only_what_the_earlier_ones_leave(seed):
+def test_later_group_adds_only_the_remainder(seed):
+    """A later group adds only what the earlier ones leave."""
     matrix = dependent(seed)
     order = np.random.default_rng(100 + seed).permutation(13)
     groups = [order[:5], order[5:9]]  # the last four are named by none and come last
@@ -48,7 +51,8 @@ def test_a_later_group_adds_only_what_the_earlier_ones_leave(seed):
         assert np.isin(kept, order[:stop]).sum() == np.linalg.matrix_rank(scaled[:, order[:stop]], tol=1e-8)
 
 
-def test_of_two_equal_columns_the_preferred_one_is_kept_whichever_comes_first():
+def test_preferred_of_equal_columns_stays():
+    """Of two equal columns the preferred one is kept, whichever comes first."""
     rng = np.random.default_rng(1)
     matrix = rng.normal(size=(20, 3))
     matrix = np.column_stack([matrix, 2.0 * matrix[:, 0]])
@@ -80,7 +84,8 @@ def test_units_of_the_columns_do_not_matter():
     assert np.allclose(other.coefficients, regrouped, rtol=1e-8, atol=1e-10 * np.abs(regrouped).max())
 
 
-def test_the_tolerance_decides_on_a_nearly_dependent_column():
+def test_tolerance_decides_near_dependence():
+    """The tolerance decides on a nearly dependent column."""
     rng = np.random.default_rng(6)
     matrix = rng.normal(size=(50, 4))
     matrix = np.column_stack([matrix, matrix @ rng.normal(size=4) + 1e-4 * rng.normal(size=50)])

@@ -40,16 +40,19 @@ def breaking(failures: int, error: type[BaseException]) -> type:
 REAL = clarabel.DefaultSolver
 
 
-def test_a_program_with_rows_and_a_matrix_has_its_optimum():
+def test_rows_and_matrix_reach_the_optimum():
+    """A program with rows and a matrix has its optimum."""
     np.testing.assert_allclose(optimum(), [1.0, 0.0], atol=1e-7)
 
 
-def test_after_a_panic_a_lower_accuracy_is_solved(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_panic_lowers_the_accuracy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a panic the program is solved at a lower accuracy."""
     monkeypatch.setattr(clarabel, "DefaultSolver", breaking(1, PanicException))
     np.testing.assert_allclose(optimum(), [1.0, 0.0], atol=1e-6)
 
 
-def test_a_panic_at_every_accuracy_is_no_convergence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_panic_at_every_accuracy_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A panic at every accuracy is reported as no convergence."""
     monkeypatch.setattr(clarabel, "DefaultSolver", breaking(len(ACCURACIES), PanicException))
     with pytest.raises(NotConverged, match="eigenvalues do not converge"):
         optimum()

@@ -24,7 +24,8 @@ def planted(seed: int, truth: np.ndarray = TRUTH, count: int = 400) -> Triangles
 
 
 @pytest.mark.parametrize("rule", list(Rule))
-def test_planted_zeros_go_and_strong_parameters_stay(rule):
+def test_planted_zeros_go_and_others_stay(rule):
+    """Planted zeros go, and strong parameters stay."""
     found = [eliminate(planted(seed), rule) for seed in range(20)]
     assert all(set(range(5)) <= set(f.kept.tolist()) for f in found)
     surplus = np.mean([len(f.kept) - 5 for f in found])
@@ -40,7 +41,8 @@ def test_where_all_are_strong_nothing_goes(rule):
     assert np.array_equal(found.base.estimate.values, found.essential.estimate.values)
 
 
-def test_the_rsd_rule_alone_sends_home_a_certain_parameter_beside_a_more_certain_one_and_both_does_not():
+def test_rsd_rule_alone_drops_a_certain_one():
+    """The RSD rule alone drops a certain parameter beside a more certain one; both rules together do not."""
     rng = np.random.default_rng(4)
     matrix = rng.normal(size=(2000, 2)) * [100.0, 1.0]
     target = matrix @ [10.0, 1.0] + rng.normal(size=2000)
@@ -51,7 +53,8 @@ def test_the_rsd_rule_alone_sends_home_a_certain_parameter_beside_a_more_certain
     assert both.steps == () and both.refused is not None and both.refused.p < 1e-6
 
 
-def test_the_f_rule_keeps_each_zero_with_its_stated_probability():
+def test_f_rule_keeps_zeros_at_stated_rate():
+    """The F rule keeps each zero with its stated probability."""
     kept = np.zeros(5)
     for seed in range(200):
         found = eliminate(planted(seed), Rule.F, level=0.05, std=STD)
@@ -60,7 +63,8 @@ def test_the_f_rule_keeps_each_zero_with_its_stated_probability():
     assert 0.02 < rate < 0.09
 
 
-def test_the_statistic_is_the_f_test_of_two_residual_sums():
+def test_statistic_is_f_of_residual_sums():
+    """The statistic is the F test of two residual sums."""
     data = planted(5)
     base = ols(data)
     gone, rest = [6, 8, 9], [0, 1, 2, 3, 4, 5, 7]
@@ -74,7 +78,8 @@ def test_the_statistic_is_the_f_test_of_two_residual_sums():
     assert p == pytest.approx(scipy.stats.f.sf(expected, 3, 390), rel=1e-6)
 
 
-def test_the_essential_estimate_is_that_of_the_kept_columns_with_the_base_weights():
+def test_essential_estimate_has_base_weights():
+    """The essential estimate is that of the remaining columns with the base weights."""
     data = planted(6)
     found = eliminate(data)
     direct = wls(data.select(found.kept), found.base.group_std)
@@ -100,12 +105,14 @@ def test_keep_and_drop_lists_are_obeyed():
     assert next(step for step in found.steps if step.name == "s2").p < 1e-6  # obeyed, and its price written down
 
 
-def test_all_kept_by_name_leaves_nothing_to_do():
+def test_keeping_all_leaves_nothing_to_do():
+    """Keeping all by name leaves nothing to do."""
     found = eliminate(planted(9), Rule.RSD, keep=NAMES)
     assert found.steps == () and found.refused is None
 
 
-def test_inflation_keeps_fewer_weak_parameters():
+def test_inflation_drops_weak_parameters():
+    """Inflation keeps fewer weak parameters."""
     weak = TRUTH.copy()
     weak[5:] = 0.05
     plain, inflated = (
@@ -115,7 +122,8 @@ def test_inflation_keeps_fewer_weak_parameters():
     assert plain > inflated + 2
 
 
-def test_unknown_and_contradicting_names_are_refused():
+def test_unknown_and_clashing_names_fail():
+    """Unknown and contradicting names are refused."""
     with pytest.raises(CalibError, match="Ia9"):
         eliminate(planted(0), keep=["Ia9"])
     with pytest.raises(CalibError, match="s1 cannot be both kept and dropped"):

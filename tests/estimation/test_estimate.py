@@ -26,7 +26,8 @@ def fit_decay(seed: int) -> tuple[np.ndarray, np.ndarray, float]:
     return found.state, covariance(found.factor), found.cost / 57
 
 
-def test_normalised_errors_over_many_seeds_are_chi_squared():
+def test_normalised_errors_are_chi_squared():
+    """Normalised errors over many seeds are chi squared."""
     sizes, variances = [], []
     for seed in range(400):
         x, c, variance = fit_decay(seed)
@@ -42,7 +43,8 @@ def test_sigma_and_rsd():
     assert e.rsd == pytest.approx([10.0, np.inf, 2.5])
 
 
-def test_strong_correlations_name_the_planted_pairs_strongest_first():
+def test_correlations_are_listed_by_strength():
+    """Strong correlations name the planted pairs, the strongest first."""
     rng = np.random.default_rng(0)
     matrix = rng.normal(size=(500, 5))
     matrix[:, 3] = matrix[:, 0] + 0.05 * rng.normal(size=500)

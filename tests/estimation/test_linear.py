@@ -13,7 +13,8 @@ from calib.estimation.triangles import collect
 STD = np.array([0.1, 1.0, 5.0])
 
 
-def test_ols_is_the_least_squares_solution_of_numpy_with_the_textbook_covariance():
+def test_ols_is_least_squares_of_numpy():
+    """OLS is the least-squares solution of NumPy, with the textbook covariance."""
     matrix, target, _ = noisy(0, STD)
     fit = ols(collect(matrix, target))
     expected, rss, *_ = np.linalg.lstsq(matrix, target)
@@ -26,7 +27,8 @@ def test_ols_is_the_least_squares_solution_of_numpy_with_the_textbook_covariance
     assert fit.condition_normalised == pytest.approx(np.linalg.cond(matrix / np.linalg.norm(matrix, axis=0)), rel=1e-9)
 
 
-def test_wls_is_ols_of_the_rows_divided_by_their_standard_deviation():
+def test_wls_is_ols_of_scaled_rows():
+    """WLS is OLS of the rows divided by their standard deviation."""
     matrix, target, group = noisy(1, STD)
     fit = wls(collect(matrix, target, group), STD)
     w = matrix / STD[group][:, None]
@@ -35,7 +37,8 @@ def test_wls_is_ols_of_the_rows_divided_by_their_standard_deviation():
     assert fit.estimate.residual_std == pytest.approx(1.0, abs=0.1)
 
 
-def test_standard_deviations_of_the_groups_are_found_and_reproduce_themselves():
+def test_group_sigmas_reproduce_themselves():
+    """Standard deviations of the groups are found and reproduce themselves."""
     matrix, target, group = noisy(2, STD, 6000)
     data = collect(matrix, target, group)
     assert subsystem_std(data) == pytest.approx(STD, rel=0.06)
@@ -46,7 +49,8 @@ def test_standard_deviations_of_the_groups_are_found_and_reproduce_themselves():
     assert fit.estimate.residual_std == pytest.approx(1.0, abs=1e-5)
 
 
-def test_settled_standard_deviations_are_unbiased_where_parameters_are_many():
+def test_settled_sigmas_are_unbiased():
+    """Settled standard deviations are unbiased where parameters are many."""
     found = []
     for seed in range(200):
         matrix, target, group = noisy(seed, np.array([1.0, 1.0, 1.0]), 30)
@@ -59,7 +63,8 @@ def test_settled_standard_deviations_are_unbiased_where_parameters_are_many():
 @pytest.mark.parametrize(
     "estimate, std", [(ols, np.array([1.0, 1.0, 1.0])), pytest.param(wls, STD, marks=pytest.mark.slow)]
 )
-def test_the_covariance_is_true_over_many_data_sets(estimate, std):
+def test_covariance_is_true_over_data_sets(estimate, std):
+    """The covariance is true over many data sets."""
     sizes = []
     for seed in range(300):
         matrix, target, group = noisy(seed, std, 120)
@@ -69,7 +74,9 @@ def test_the_covariance_is_true_over_many_data_sets(estimate, std):
     assert np.mean(sizes) == pytest.approx(5.0, abs=4 * np.sqrt(10 / 300) + 0.25)  # F(5, 115) has mean 5.09
 
 
-def test_wls_beats_ols_on_unlike_groups_by_what_theory_says():
+def test_wls_beats_ols_by_theoretical_share():
+    """WLS beats OLS on unlike groups by what theory says."""
+
     def spread(estimate):
         values = [estimate(collect(*noisy(seed, STD))).estimate.values for seed in range(100)]
         return np.mean((np.array(values) - TRUTH) ** 2, axis=0)
@@ -83,7 +90,8 @@ def test_wls_beats_ols_on_unlike_groups_by_what_theory_says():
     assert np.all((gain > promised / 2) & (gain < promised * 2))
 
 
-def test_autocorrelated_residuals_need_the_inflation_and_get_a_true_covariance_with_it():
+def test_autocorrelation_needs_inflation():
+    """Autocorrelated residuals need the inflation, and get a true covariance with it."""
     naive, corrected, phi = [], [], 0.9
     tau = np.array([(1 + phi) / (1 - phi)])
     for seed in range(150):
@@ -100,7 +108,8 @@ def test_autocorrelated_residuals_need_the_inflation_and_get_a_true_covariance_w
     assert fit.estimate.dof == int(2000 / tau[0] - 3)
 
 
-def test_inflation_leaves_the_values_and_scales_a_single_groups_covariance():
+def test_inflation_scales_covariance_alone():
+    """Inflation leaves the values and scales a single group's covariance."""
     data = collect(*noisy(3, STD)[:2])
     plain, inflated = ols(data), ols(data, np.array([4.0]))
     assert np.array_equal(plain.estimate.values, inflated.estimate.values)
@@ -108,7 +117,8 @@ def test_inflation_leaves_the_values_and_scales_a_single_groups_covariance():
     assert ratio == pytest.approx(4.0 * (600 - 5) / (600 - 20), rel=1e-9)
 
 
-def test_a_prior_acts_as_rows_of_its_own_and_the_unknown_stays_free():
+def test_prior_acts_as_additional_rows():
+    """A prior acts as rows of its own, and what it does not know stays free."""
     matrix, target, group = noisy(4, STD)
     mean, width = np.full(5, 0.7), np.array([0.1, np.inf, 0.5, 0.01, np.inf])
     fit = ridge(collect(matrix, target, group), mean, np.diag(width**2), STD)
@@ -118,7 +128,8 @@ def test_a_prior_acts_as_rows_of_its_own_and_the_unknown_stays_free():
     assert fit.estimate.covariance == pytest.approx(np.linalg.inv(w.T @ w), rel=1e-9)
 
 
-def test_a_prior_makes_an_unidentifiable_problem_solvable_and_leaves_the_sum_to_the_data():
+def test_prior_leaves_the_sum_to_the_data():
+    """A prior makes an unidentifiable problem solvable, and leaves the sum to the data."""
     rng = np.random.default_rng(5)
     column = rng.normal(size=(50, 1))
     data = collect(np.hstack([column, column]), column[:, 0] * 3.0 + rng.normal(0, 0.01, 50))
@@ -127,7 +138,8 @@ def test_a_prior_makes_an_unidentifiable_problem_solvable_and_leaves_the_sum_to_
 
 
 @pytest.mark.parametrize(("column", "named"), [(3, ("XX1", "Fv1", "Fc1")), (1, ("MX2",))])
-def test_dependent_columns_and_those_without_effect_are_named_and_only_they(column, named):
+def test_dependent_or_idle_columns_are_named(column, named):
+    """Dependent columns and those without effect are named, and only they."""
     matrix, target, _ = noisy(6, STD)
     matrix[:, column] = 2 * matrix[:, 0] - matrix[:, 2] if column == 3 else 0.0
     with pytest.raises(Unidentifiable, match="base") as caught:
@@ -135,7 +147,8 @@ def test_dependent_columns_and_those_without_effect_are_named_and_only_they(colu
     assert caught.value.names == named
 
 
-def test_too_few_rows_nan_and_wrong_shapes_are_refused():
+def test_few_rows_nan_and_shapes_are_refused():
+    """Too few rows, NaN and wrong shapes are refused."""
     matrix, group = rows(0)
     with pytest.raises(Unidentifiable):
         ols(collect(matrix[:4], np.ones(4)))
@@ -151,14 +164,16 @@ def test_too_few_rows_nan_and_wrong_shapes_are_refused():
         wls(collect(matrix, np.ones(600), group), np.array([1.0, 0.0, 1.0]))
 
 
-def test_an_ill_conditioned_but_regular_problem_is_solved_to_qr_accuracy():
+def test_ill_conditioning_keeps_qr_accuracy():
+    """An ill-conditioned but regular problem is solved to QR accuracy."""
     matrix = scipy.linalg.hilbert(8)[:, :6] @ np.diag(10.0 ** np.arange(6))
     stacked = np.vstack([matrix] * 5)
     fit = ols(collect(stacked, stacked @ np.ones(6)))  # the normal equations would keep no digit
     assert fit.estimate.values == pytest.approx(np.ones(6), abs=1e-7)
 
 
-def test_correlated_residuals_ask_for_another_model_not_for_more_rows():
+def test_correlation_asks_for_another_model():
+    """Correlated residuals ask for another model, not for more rows."""
     data = collect(*noisy(3, np.ones(3)))
     with pytest.raises(Unidentifiable, match="swapped columns"):
         wls(data, inflation=np.array([400.0, 1.0, 1.0]))

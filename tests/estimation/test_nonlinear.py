@@ -108,7 +108,8 @@ def test_no_accepted_step_is_worse(name):
     assert len(found.history) <= found.iterations
 
 
-def test_damping_zero_is_iterative_linear_least_squares():
+def test_no_damping_is_linear_least_squares():
+    """Damping zero is iterative linear least squares."""
     problem = decay()
     x = problem[2]
     for count in range(1, 5):
@@ -117,7 +118,8 @@ def test_damping_zero_is_iterative_linear_least_squares():
         x = x + np.linalg.lstsq(problem[1](x), -problem[0](x), rcond=None)[0]
 
 
-def test_damping_zero_takes_worse_steps_and_levenberg_marquardt_does_not():
+def test_damping_alone_refuses_worse_steps():
+    """Damping zero takes worse steps, and Levenberg-Marquardt does not."""
     problem = rosenbrock()
     plain = solve(stated(problem), add, problem[2], damping=0.0)
     assert plain.status.good and np.diff(plain.history).max() > 0  # from (-1.2, 1) the first full step goes uphill
@@ -143,7 +145,7 @@ def test_the_iteration_limit_is_said():
     assert found.iterations == 3
 
 
-def test_what_damping_does_not_reach_is_not_called_converged():
+def test_crawling_damping_is_no_convergence():
     """Eq. 12 scales by the present diag(WᵀW); where the residual stays large it crawls (Moré's maximum cures it).
 
     The point of this test is the verdict: far from the optimum (85822.2) the status is not ``converged``.
@@ -162,7 +164,8 @@ def test_a_wrong_jacobian_stalls():
     assert found.state == pytest.approx(problem[2])  # no uphill step was taken
 
 
-def test_a_start_at_the_solution_converges_at_once():
+def test_start_at_solution_converges_at_once():
+    """A start at the solution converges at once."""
     problem = rosenbrock()
     found = solve(stated(problem), add, np.ones(2))
     assert found.status is Status.CONVERGED and found.iterations == 1
@@ -185,14 +188,15 @@ def test_unknowns_may_live_on_a_manifold():
     assert np.arctan2(found.state[1], found.state[0]) % (2 * np.pi) == pytest.approx(angles.mean(), abs=1e-7)
 
 
-def test_the_covariance_is_the_inverse_information():
+def test_covariance_is_inverse_information():
+    """The covariance is the inverse information."""
     matrix = np.random.default_rng(2).normal(size=(40, 6))
     factor = triangle(np.zeros(40), matrix).factor
     assert covariance(factor, 4.0) == pytest.approx(4.0 * np.linalg.inv(matrix.T @ matrix))
 
 
 @pytest.mark.parametrize("spread", [1.0, 1e-4, 1e-9])
-def test_many_rows_piece_by_piece_are_reduced_as_at_once(spread):
+def test_many_rows_are_reduced_in_pieces(spread):
     """Well-conditioned rows by WᵀW, others by QR: R and z solve the problem as QR of all rows does."""
     rng = np.random.default_rng(2)
     matrix, residual = rng.normal(size=(60_000, 6)), rng.normal(size=60_000)

@@ -21,7 +21,8 @@ def planted(seed: int, rows: int = 300) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_planted_groups_are_found_and_nearly_all_others_switched_off(seed):
+def test_planted_groups_alone_stay_on(seed):
+    """Planted groups are found, and nearly all others are switched off."""
     matrix, y, groups, truth = planted(seed)
     found = relevance(gram(y, matrix), groups, np.full(44, 0.1), iterations=60)
     on = {int(g) for g in groups[(found.ridge > 0) & (groups >= 0)]}
@@ -34,7 +35,8 @@ def test_planted_groups_are_found_and_nearly_all_others_switched_off(seed):
     assert 6 - 0.5 < found.effective < 6 + 2 * 8
 
 
-def test_it_errs_less_than_least_squares_on_all_columns():
+def test_errs_less_than_ols_on_all_columns():
+    """Relevance errs less than least squares on all columns."""
     ours, plain = [], []
     for seed in range(20):
         matrix, y, groups, truth = planted(seed, rows=80)
@@ -55,7 +57,8 @@ def test_pure_noise_leaves_next_to_nothing():
     assert np.mean(effective) < 0.25 * 40
 
 
-def test_one_iteration_is_the_ridge_posterior_of_the_given_sizes():
+def test_one_iteration_is_ridge_posterior():
+    """One iteration is the ridge posterior of the given sizes."""
     matrix, y, groups, _ = planted(3)
     size = np.random.default_rng(0).uniform(0.2, 0.3)
     found = relevance(gram(y, matrix), groups, np.full(44, size), iterations=1)
@@ -107,7 +110,7 @@ def test_statistics_add_up():
         assert getattr(parts, name) == pytest.approx(getattr(whole, name), abs=1e-9)
 
 
-def test_condensed_coordinates_give_what_all_columns_give_in_half_of_them():
+def test_condensed_columns_give_the_same():
     """Harmonics of two joints that turn by a third of a turn, beside three free columns; the prior falls with order."""
     rng = np.random.default_rng(8)
     order = np.arange(1, 31)

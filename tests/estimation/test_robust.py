@@ -18,13 +18,16 @@ def cauchy(s: np.ndarray, c: float = 2.385) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name, loss", [("huber", huber), ("cauchy", cauchy), ("none", lambda s: s**2 / 2)])
-def test_the_weight_times_the_residual_is_the_slope_of_the_loss(name, loss):
+def test_weighted_residual_is_slope_of_loss(name, loss):
+    """The weight times the residual is the slope of the loss."""
     sizes = np.random.default_rng(0).uniform(0.05, 8.0, 40)
     check(lambda s: loss(s).sum(), lambda s: weights(s, name) * s, sizes)
 
 
 @pytest.mark.parametrize("name", ["huber", "cauchy"])
-def test_the_usual_constants_are_95_percent_efficient_on_normal_residuals(name):
+def test_constants_are_95_percent_efficient(name):
+    """The usual constants are 95 percent efficient on normal residuals."""
+
     def psi(s: float) -> float:
         return float(weights(np.abs(np.array(s)), name) * s)
 
@@ -33,7 +36,8 @@ def test_the_usual_constants_are_95_percent_efficient_on_normal_residuals(name):
     assert slope**2 / power == pytest.approx(0.95, abs=1e-3)
 
 
-def test_a_scale_of_its_own_replaces_the_constant():
+def test_own_scale_replaces_the_constant():
+    """A scale that is stated replaces the constant."""
     sizes = np.array([0.5, 2.0, 6.0])
     assert weights(sizes, "huber", 2.0) == pytest.approx([1.0, 1.0, 1 / 3])
     assert weights(sizes, "cauchy", 2.0) == pytest.approx([1 / (1 + 1 / 16), 0.5, 0.1])
@@ -44,7 +48,8 @@ def test_an_unknown_loss_is_refused():
         weights(np.ones(3), "tukey")
 
 
-def test_the_spread_is_sigma_with_and_without_outliers():
+def test_spread_is_sigma_despite_outliers():
+    """The spread is sigma with and without outliers."""
     rng = np.random.default_rng(1)
     clean = 3e-4 * rng.normal(size=20000)
     assert spread(clean) == pytest.approx(3e-4, rel=0.02)

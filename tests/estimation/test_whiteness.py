@@ -22,14 +22,16 @@ def ar(seed: int, coefficients: list[float], count: int = 4000) -> np.ndarray:
     ]
 
 
-def test_the_autocorrelation_is_its_defining_sum():
+def test_autocorrelation_is_its_defining_sum():
+    """The autocorrelation is its defining sum."""
     x = np.random.default_rng(0).normal(size=57) + 3.0
     c = x - x.mean()
     assert autocorrelation(x, 5) == pytest.approx([np.sum(c[:-k] * c[k:]) / np.sum(c**2) for k in range(1, 6)])
     assert np.array_equal(autocorrelation(np.ones(30), 4), np.zeros(4))
 
 
-def test_partial_autocorrelations_solve_the_yule_walker_equations_and_end_at_the_order():
+def test_partials_solve_yule_walker():
+    """Partial autocorrelations solve the Yule-Walker equations and end at the order."""
     rho = autocorrelation(ar(1, [0.5, 0.3]), 8)
     found = partial_autocorrelation(rho)
     for k in range(1, 9):
@@ -39,7 +41,9 @@ def test_partial_autocorrelations_solve_the_yule_walker_equations_and_end_at_the
     assert np.abs(found[2:]).max() < 0.06
 
 
-def test_ljung_box_rejects_white_series_at_its_level_and_sees_a_weak_correlation():
+def test_ljung_box_level_and_power():
+    """Ljung-Box rejects white series at its level and sees a weak correlation."""
+
     def rejected(series):
         return ljung_box(autocorrelation(series, 20), len(series))[1] < 0.05
 
@@ -50,7 +54,8 @@ def test_ljung_box_rejects_white_series_at_its_level_and_sees_a_weak_correlation
     assert power > 0.95
 
 
-def test_examine_tells_white_normal_residuals_from_others():
+def test_examine_tells_white_residuals():
+    """Examine tells white normal residuals from others."""
     rng = np.random.default_rng(3)
     white, coloured, heavy = (examine(x) for x in (rng.normal(size=3000), ar(3, [0.8]), rng.standard_t(3, 3000)))
     assert white.outside < 0.15 < 0.3 < coloured.outside
@@ -61,23 +66,27 @@ def test_examine_tells_white_normal_residuals_from_others():
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.5, 0.9])
-def test_the_inflation_of_an_autoregression_is_its_integrated_correlation(phi):
+def test_inflation_of_an_autoregression(phi):
+    """The inflation of an autoregression is its integrated correlation."""
     found = np.mean([inflation(ar(s, [phi], 20_000)) for s in range(8)])
     assert found == pytest.approx((1 + phi) / (1 - phi), rel=0.1)
 
 
-def test_the_inflation_is_the_variance_of_the_mean_over_that_of_white_noise():
+def test_inflation_is_a_ratio_of_variances():
+    """The inflation is the variance of the mean over that of white noise."""
     means = [np.mean(ar(s, [0.8], 2000)) for s in range(400)]
     promised = np.mean([inflation(ar(s, [0.8], 2000)) * np.var(ar(s, [0.8], 2000)) / 2000 for s in range(30)])
     assert np.var(means) == pytest.approx(promised, rel=0.3)
 
 
-def test_negative_correlation_never_counts_as_more_than_the_rows_there_are():
+def test_negative_correlation_adds_no_rows():
+    """Negative correlation never counts as more than the rows there are."""
     assert inflation(ar(4, [-0.6])) == 1.0
     assert inflation(np.ones(5)) == 1.0
 
 
-def test_r_squared_is_one_for_no_residual_zero_for_the_mean_and_negative_below():
+def test_r_squared_at_its_reference_points():
+    """R squared is one for no residual, zero for the mean, and negative below."""
     y = np.random.default_rng(5).normal(size=100) + 4.0
     assert r_squared(y, np.zeros(100)) == 1.0
     assert r_squared(y, y - y.mean()) == pytest.approx(0.0)
@@ -90,7 +99,8 @@ def test_too_few_residuals_are_refused():
 
 
 @pytest.mark.parametrize("count", [20, 33, 1000])
-def test_the_normal_law_is_tested_as_scipy_does(count):
+def test_normality_test_is_that_of_scipy(count):
+    """Normality is tested as SciPy does."""
     rng = np.random.default_rng(count)
     for x in (rng.standard_normal(count), rng.standard_exponential(count), rng.standard_t(2, count)):
         found = examine(x, lags=10)
@@ -98,7 +108,7 @@ def test_the_normal_law_is_tested_as_scipy_does(count):
         assert found.normal_p == pytest.approx(scipy.stats.normaltest(x).pvalue, rel=1e-9)
 
 
-def test_what_a_fit_took_out_of_correlated_errors_is_put_back():
+def test_absorbed_correlation_is_put_back():
     """354 errors behind a fit of 14 slow columns, as 7 s of a joint: residuals read 0.6 of their τ, with it 0.8."""
     read = []
     for seed in range(30):

@@ -72,7 +72,8 @@ def told(
     )
 
 
-def test_pseudo_inertia_is_one_to_one_and_knows_possible_bodies():
+def test_pseudo_inertia_is_one_to_one():
+    """Pseudo-inertia is one to one and knows possible bodies."""
     body = np.random.default_rng(1).standard_normal((5, 10))
     assert np.abs(pseudo_inertia.to_standard(pseudo_inertia.from_standard(body)) - body).max() < 1e-14
     ball = pseudo_inertia.ball(2.0, 0.5, np.array([1.0, -2.0, 0.3]))
@@ -92,7 +93,7 @@ def test_the_same_divergence_in_any_frame():
 
 
 @pytest.mark.parametrize(("seeds", "outside"), [(range(1), 0), pytest.param(range(6), 1, marks=pytest.mark.slow)])
-def test_planted_robots_come_back_within_their_covariance(seeds, outside):
+def test_planted_robots_within_covariance(seeds, outside):
     """Pooled over seeds, the distance² from the estimate stays within χ²(b), and the truth within the posterior."""
     inside = 0
     for seed in seeds:
@@ -109,7 +110,8 @@ def test_planted_robots_come_back_within_their_covariance(seeds, outside):
 
 
 @pytest.mark.slow
-def test_with_exact_data_the_torques_are_those_of_the_base_parameters():
+def test_exact_data_keep_base_torques():
+    """With exact data the torques are those of the base parameters."""
     _, model, _, data = planted(3, noise=1e-5)
     found = solve.find_possible(data)
     samples = bases.random_samples(model, 50, 9)
@@ -118,7 +120,8 @@ def test_with_exact_data_the_torques_are_those_of_the_base_parameters():
     assert np.abs(matrix @ found.dynamics.values - wanted).max() < 1e-5 * np.abs(wanted).max()
 
 
-def test_an_impossible_base_is_told_with_the_body_and_a_possible_one_is_not():
+def test_impossible_base_is_told_with_body():
+    """An impossible base is told with the body, and a possible one is not."""
     _, model, base, data = planted(4)
     assert data.distance(nearest(problem_of(data))) < 4.0
     values = np.array(data.values)
@@ -132,7 +135,7 @@ def test_an_impossible_base_is_told_with_the_body_and_a_possible_one_is_not():
 
 
 @pytest.mark.slow
-def test_the_euclidean_prior_is_another_robot_as_near_to_the_data():
+def test_euclidean_prior_fits_data_as_well():
     """They differ in what the torques do not tell; only the entropic one keeps off the border of what can exist."""
     _, _, _, data = planted(3)
     entropic, euclidean = (solve.find_possible(data, prior=prior) for prior in solve.PRIORS)
@@ -149,7 +152,8 @@ def test_an_unknown_prior_is_refused():
         solve.find_possible(data, prior="euclid")
 
 
-def test_without_a_cad_rods_of_a_mass_the_data_choose_stand_in():
+def test_rods_stand_in_for_a_cad():
+    """Without a CAD, rods of a mass that the data choose stand in."""
     _, model, base, data = planted(5)
     bare = told(arm(None), model, base, data.values, data.covariance)
     found = solve.find_possible(bare)
@@ -161,7 +165,8 @@ def problem_of(data: Information) -> BodyCost:
     return make_problem(data, next(find_prior_bodies(data.chain, data.dynamics.model)))
 
 
-def test_the_optimum_is_the_same_from_that_of_another_weight():
+def test_optimum_does_not_depend_on_start():
+    """The optimum is the same from that of another weight."""
     _, model, _, information = planted(3)
     problem = make_problem(information, next(find_prior_bodies(arm(None), model)))
     cold = solve.solve(problem, 1e3)
@@ -169,7 +174,8 @@ def test_the_optimum_is_the_same_from_that_of_another_weight():
     assert np.abs(warm - cold).max() < 1e-6 * np.abs(cold).max()
 
 
-def test_slope_and_curvature_are_those_of_the_cost():
+def test_slope_and_curvature_match_the_cost():
+    """Slope and curvature are those of the cost."""
     _, _, _, data = planted(6, noise=1.0)
     problem = problem_of(data)
     values = solve.solve(problem, 30.0)
@@ -211,7 +217,7 @@ def test_cvxpy_finds_the_same_optimum():
     assert np.linalg.norm((theirs - values) / scale) < 1e-2
 
 
-def test_a_term_that_was_switched_off_leaves_the_others_free():
+def test_switched_off_term_frees_the_others():
     """Its information is without bound: 1e12 against 1e4 of any other."""
     data = planted(0)[3]
     pinned = 1e12 * np.eye(data.factor.shape[1])[-2]
@@ -221,7 +227,7 @@ def test_a_term_that_was_switched_off_leaves_the_others_free():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pull", [0.0, 50.0])
-def test_log_cholesky_factors_lead_to_the_same_nearest_robot(pull):
+def test_log_cholesky_finds_the_same_robot(pull):
     """An independent way without a cone: P = L Lᵀ with exp on L's diagonal, exp of drive terms, by least squares.
 
     With a pull, the rows of the Euclidean prior beside those of the data; from the solution itself, slightly off, since

@@ -20,7 +20,9 @@ def test_a_gain_that_is_not_told_is_empty():
     assert table["sigma"] == [pytest.approx(0.1), None, None]
 
 
-def test_a_gain_that_runs_away_is_not_told_and_the_others_are(monkeypatch):
+def test_only_the_runaway_gain_is_withheld(monkeypatch):
+    """A gain that runs away is not told, and the others are."""
+
     def identify(data, known, inflation, start=None, reference=None, own=()):
         if 2 not in own:
             raise NotConverged("the gains do not settle", np.array([1.1, 1.0, 9e4]))

@@ -38,7 +38,8 @@ def away(found: dict[str, tuple[float, float]], sigma: dict[str, tuple[float, fl
 @pytest.mark.parametrize(
     "method", [*(pytest.param(method, marks=pytest.mark.slow) for method in ("ols", "tls")), "irls"]
 )
-def test_all_methods_find_the_truth_of_a_clean_log(robot, tmp_path, capsys, method):
+def test_all_methods_find_truth_of_clean_log(robot, tmp_path, capsys, method):
+    """All methods find the truth of a clean log."""
     log = planted.write(tmp_path, "train.npz", 0)
     found = identify(robot, log, method, tmp_path / "out")
     assert away(found, found) < 2.0
@@ -48,7 +49,7 @@ def test_all_methods_find_the_truth_of_a_clean_log(robot, tmp_path, capsys, meth
 
 
 @pytest.mark.slow
-def test_robust_weights_gate_a_sensor_that_hangs(robot, tmp_path):
+def test_robust_weights_gate_hanging_sensor(robot, tmp_path):
     """Torques frozen for a second here and there: least squares is off by many of its clean sigmas, irls by few.
 
     Neither explains the frozen rows: both fail on the training motion.
@@ -63,7 +64,7 @@ def test_robust_weights_gate_a_sensor_that_hangs(robot, tmp_path):
     assert off["irls"] < 0.1 * off["wls"] and off["irls"] < 4.0
 
 
-def test_total_least_squares_is_right_where_columns_are_as_noisy_as_it_says():
+def test_tls_is_right_for_noisy_columns():
     """Two columns nearly alike, noise of a hundredth of each: least squares shrinks their difference, TLS does not."""
     rng = np.random.default_rng(0)
     names, truth = ("ZZ1R", "Fv1", "Fc1", "off1"), np.array([40.0, 20.0, 30.0, 5.0])
@@ -84,7 +85,7 @@ def test_total_least_squares_is_right_where_columns_are_as_noisy_as_it_says():
     assert 0.7 < np.std(errors["tls"]) < 1.3
 
 
-def test_what_a_joint_lacks_widens_the_sigmas_of_all_least_squares(robot: Path, tmp_path: Path):
+def test_joint_error_widens_all_sigmas(robot: Path, tmp_path: Path):
     """A slow wave in one joint's torque: irls and tls promise no more than weighted least squares of the same rows."""
     log = planted.series(0)
     drift = np.convolve(np.random.default_rng(0).normal(size=len(log["t"])), np.hanning(300), "same")
@@ -101,7 +102,7 @@ def test_what_a_joint_lacks_widens_the_sigmas_of_all_least_squares(robot: Path, 
     assert "autocorrelated-residual" in {one.code for one in model_findings(inputs.cases, found["tls"])}
 
 
-def test_a_parameter_on_its_bound_has_no_sigma(robot: Path, tmp_path: Path):
+def test_parameter_on_bound_has_no_sigma(robot: Path, tmp_path: Path):
     """Certainty would be the bound's, not the data's: the cell is empty, the others have theirs, readers get NaN."""
     options, out = tmp_path / "o.toml", tmp_path / "out"
     options.write_text("[constraints]\nbounds = { Fv1 = [4.0, inf] }\n")

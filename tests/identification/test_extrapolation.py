@@ -38,7 +38,9 @@ def without_friction(case: Case) -> Case:
 @pytest.mark.parametrize(
     "one", [drives.term("F", shape, 0, 2.0, *more) for shape, *more in (("cubic",), ("speed",), ("root", 0.01))]
 )
-def test_a_shape_that_bends_keeps_its_value_beyond_the_edge(one):
+def test_bent_shape_stays_beyond_the_edge(one):
+    """A shape that bends keeps its value beyond the edge."""
+
     def at(v: float) -> float:
         state = np.array([0.0]), np.array([v]), np.array([0.0])
         return float(one.values(TermMotion(*state))[0])
@@ -50,7 +52,8 @@ def test_a_shape_that_bends_keeps_its_value_beyond_the_edge(one):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_friction_of_sensors_behind_the_gears_brakes_and_is_small(seed):
+def test_sensor_friction_brakes_and_is_small(seed):
+    """Friction of sensors behind the gears brakes and is small."""
     case = without_friction(planted.case("log", seed, noise=0.2))
     found = identify(planted.arm(), [case], replace(PLAIN, friction="auto"))
     terms, values = found.terms, found.fitted.estimate.values
@@ -59,7 +62,8 @@ def test_friction_of_sensors_behind_the_gears_brakes_and_is_small(seed):
     assert max(own) < 0.1 * min(planted.DRIVES["Fc"])
 
 
-def test_a_coupling_is_found_and_written_and_none_where_there_is_none():
+def test_planted_coupling_alone_is_found():
+    """A coupling is found and written, and none where there is none."""
     case = planted.case("log", 0, noise=0.05, terms=COUPLED, values=GEARS)
     other = planted.case("other", 9, noise=0.05, terms=COUPLED, values=GEARS)
     found = identify(planted.arm(), [case], replace(PLAIN, friction="auto"))
@@ -73,7 +77,7 @@ def test_a_coupling_is_found_and_written_and_none_where_there_is_none():
     assert "coupling" not in alone.friction.chosen and drive_table(alone.dynamics).pairs == ()
 
 
-def test_no_coupling_is_found_in_a_motion_of_one_frequency_that_does_not_tell_it_apart():
+def test_one_frequency_tells_no_coupling():
     """Friction that the standard model lacks is explained by other joints' motion there, but not elsewhere."""
     case = planted.case("log", 0, noise=0.05, harmonics=1)
     v = case.motion.v
@@ -82,7 +86,7 @@ def test_no_coupling_is_found_in_a_motion_of_one_frequency_that_does_not_tell_it
     assert "coupling" not in found.friction.chosen and len(found.friction.steps) > 1
 
 
-def test_a_joint_that_never_reverses_has_friction_like_the_others_and_no_offset():
+def test_one_way_joint_has_no_torque_offset():
     """Coulomb friction in proportion to the torque limits: joint 1's constant torque is its friction, not an offset."""
     arm = planted.arm()
     arm = replace(
@@ -97,7 +101,8 @@ def test_a_joint_that_never_reverses_has_friction_like_the_others_and_no_offset(
     assert unexplained(found, other) < 5.0
 
 
-def test_regimes_hold_each_joints_extremes_and_with_the_rest_are_everything():
+def test_regimes_hold_extremes_of_joints():
+    """Regimes hold each joint's extremes, and with the rest are everything."""
     case = planted.case("log", 0)
     found = identify(planted.arm(), [case], PLAIN)
     rate = design_decimator(case.motion.rate, case.motion.decimator.factor)
@@ -112,7 +117,8 @@ def test_regimes_hold_each_joints_extremes_and_with_the_rest_are_everything():
     )
 
 
-def test_friction_drives_a_joint_only_where_it_moves():
+def test_friction_drives_only_moving_joints():
+    """Friction drives a joint only where it moves."""
     case, model, values = planted.case("log", 0), planted.model(), planted.truth()
     values[[model.names.index(name) for name in ("Fv2", "Fc2")]] *= -1.0
     speeds = np.array(case.motion.v)

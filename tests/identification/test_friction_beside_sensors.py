@@ -16,7 +16,8 @@ from calib.simulation.virtual_cells import virtual_cell
 
 
 @pytest.mark.slow
-def test_friction_with_memory_and_cables_of_a_simulated_arm() -> None:
+def test_friction_with_memory_and_cables() -> None:
+    """Friction with memory, and cables, of a simulated arm are identified beside torque sensors."""
     cell = virtual_cell("lwr4plus")
     arm = moving_arm(cell, "lwr4plus")  # 30 % of Fc has memory, cables pull, gears are warm: see its note
     lower, upper = arm.chain.sampling_limits()

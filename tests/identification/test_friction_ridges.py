@@ -22,10 +22,12 @@ def values(units: tuple[str, str]) -> np.ndarray:
     return estimate(data, np.ones(1), np.ones(1), np.zeros(2, dtype=int))[0]
 
 
-def test_what_the_motion_hardly_shows_is_not_the_larger_for_it():
+def test_hardly_shown_terms_do_not_grow():
+    """What the motion hardly shows is not the larger for it."""
     seen, hardly = values(("N*m", "N*m"))
     assert seen == pytest.approx(SEEN, abs=0.2) and abs(hardly) < 10.0 * SEEN
 
 
-def test_a_parameter_of_another_unit_has_a_size_of_its_own():
+def test_other_units_have_their_own_size():
+    """A parameter of another unit has a size of its own."""
     assert values(("N*m", "N*m*s/rad"))[1] * HARDLY == pytest.approx(SHARE, abs=0.15)

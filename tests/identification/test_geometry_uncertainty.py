@@ -31,7 +31,8 @@ MOVED = {"up": np.pi / 2 + 0.01, "upper": 0.51, "shoulder": 0.02}
 
 
 @pytest.mark.parametrize("factor", [1, 3, 8])
-def test_spreading_is_the_adjoint_of_decimation(factor):
+def test_spreading_is_adjoint_of_decimation(factor):
+    """Spreading is the adjoint of decimation."""
     rng, decimator = np.random.default_rng(factor), design_decimator(100.0, factor)
     x = rng.normal(size=(311, 2))
     y = rng.normal(size=decimate(x, decimator).shape)
@@ -51,7 +52,8 @@ def test_spreading_is_the_adjoint_of_decimation(factor):
     ],
     ids=["wls", "ols", "ridge", "prior", "thinned"],
 )
-def test_the_sensitivity_is_the_derivative_of_the_estimate(settings):
+def test_sensitivity_is_slope_of_estimate(settings):
+    """The sensitivity is the derivative of the estimate."""
     arm, case = planted.arm().with_values(MOVED), planted.case("a", 0)
     found = identify(CalibratedChain(arm, planted.arm()), [case], settings)
     how = geometry_uncertainty.estimator(found)
@@ -67,7 +69,8 @@ def test_the_sensitivity_is_the_derivative_of_the_estimate(settings):
     differences.check(refitted, matrix[:, :-2], np.array(arm.values), step=1e-5, tolerance=1e-7)
 
 
-def test_pieces_of_a_long_recording_tell_the_same(monkeypatch):
+def test_pieces_of_a_recording_tell_the_same(monkeypatch):
+    """Pieces of a long recording tell the same."""
     arm, case = planted.arm(), planted.case("a", 0, noise=0.0, duration=60.0)
     found = identify(arm, [case], PLAIN)
     whole, _, _ = geometry_uncertainty.sensitivity(found, arm, [case])
@@ -78,7 +81,7 @@ def test_pieces_of_a_long_recording_tell_the_same(monkeypatch):
     assert not np.array_equal(part, whole)
 
 
-def test_an_element_is_a_joint_that_nobody_moves():
+def test_element_is_a_joint_nobody_moves():
     """∂tau/∂value from the kernels' exact gradient, on a chain in which every element is a joint."""
     arm, case = planted.arm().with_values(MOVED), planted.case("a", 0, band=80.0, duration=6.0)
     found = identify(arm, [case], PLAIN)
@@ -105,7 +108,8 @@ def test_an_element_is_a_joint_that_nobody_moves():
     np.testing.assert_allclose(felt[:-2], np.sqrt(square / 3), rtol=1e-7, atol=1e-9)
 
 
-def test_an_offset_of_the_last_joint_turns_its_bodys_parameters_and_nothing_else():
+def test_last_offset_turns_last_body_alone():
+    """An offset of the last joint turns its body's parameters, and nothing else."""
     arm, case = planted.arm(), planted.case("a", 0, noise=0.0)
     found = identify(arm, [case], PLAIN)
     carried = geometry_uncertainty.propagate(found, arm, [case])
@@ -129,7 +133,7 @@ def test_geometry_that_is_exact_adds_nothing():
 
 
 @pytest.mark.slow
-def test_intervals_cover_the_truth_with_propagation_and_fail_without():
+def test_intervals_need_propagation_to_cover():
     """60 calibrations: the geometry drawn from its covariance, the torques noisy; the truth stays."""
     real, settings = planted.arm(), PLAIN
     truth = np.append(bases.find(planted.model()).transform @ planted.truth(), [])
@@ -168,7 +172,8 @@ def run(folder: Path, tmp_path: Path, *more: str) -> tuple[dict, list[dict], Pat
     return json.loads((out / "metrics.json").read_text())["geometry"], rows, out
 
 
-def test_the_command_carries_the_fits_covariance(tmp_path, capsys):
+def test_command_carries_covariance_of_fit(tmp_path, capsys):
+    """The command carries the fit's covariance."""
     found, rows, out = run(fitted_folder(tmp_path, 1e-6), tmp_path, "-v")
     assert found["propagated"] and found["geometry_exceeds_torque"] and found["largest_growth_of_sigma"] > 1.4
     for row in rows:
@@ -185,14 +190,16 @@ def test_the_command_carries_the_fits_covariance(tmp_path, capsys):
     assert kept is not None and kept[1, 1] == pytest.approx(1e-6), "the identified robot carries it on"
 
 
-def test_the_command_says_where_the_geometry_is_taken_as_exact(tmp_path, capsys):
+def test_geometry_taken_as_exact_is_said(tmp_path, capsys):
+    """The command says where the geometry is taken as exact."""
     found, rows, out = run(fitted_folder(tmp_path, None), tmp_path, "--no-plots")
     assert not found["propagated"] and {row["sigma_geometry"] for row in rows} == {""}
     assert "assumed exact" in capsys.readouterr().out.replace("\n", " ")
     assert not (out / calibrated.COVARIANCE).exists()
 
 
-def test_a_fit_leaves_the_covariance_of_its_chain(tmp_path):
+def test_fit_writes_covariance_of_its_chain(tmp_path):
+    """A fit writes the covariance of its chain."""
     from calib.geometry.first_guess import install
     from calib.geometry.fit import fit
     from calib.robot.chain import random_joints

@@ -49,29 +49,34 @@ def said(gravity: np.ndarray, masses: bool, without: tuple[int, ...] = (), seed:
 
 
 @pytest.mark.parametrize("masses", [True, False])
-def test_gravity_as_stated_is_not_remarked_upon(masses):
+def test_stated_gravity_is_not_remarked_upon(masses):
+    """Gravity as stated is not remarked upon."""
     for seed in range(3):
         assert not said(STATED, masses, seed=seed).refuted
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
-def test_another_mounting_is_found_with_its_vector(mount):
+def test_other_mounting_is_found_with_vector(mount):
+    """Another mounting is found with its vector."""
     gravity = np.array(MOUNTS[mount])
     hypotheses = said(gravity, masses=True)
     assert hypotheses.direction is not None and not hypotheses.absent
     assert hypotheses.direction @ gravity > 9.81**2 * np.cos(np.radians(5.0))
 
 
-def test_torques_without_gravity_are_called_that():
+def test_torques_without_gravity_are_named():
+    """Torques without gravity are named as such."""
     assert 1 in said(np.zeros(3), masses=True).absent
     assert said(np.zeros(3), masses=True).direction is None
 
 
-def test_two_joints_compensated_are_the_ones_named():
+def test_compensated_joints_are_named():
+    """Of joints compensated for gravity, the two concerned are named."""
     assert said(STATED, masses=True, without=(1, 2)).absent == (1, 2)
 
 
-def test_what_was_found_is_said_with_the_option_to_write():
+def test_mounting_is_said_with_its_option():
+    """A finding of gravity is said with the option to write."""
     joints = load("lwr4plus").joint_names
     (mounted,) = gravity_findings(said(np.array(MOUNTS["wall"]), masses=True), joints)
     assert mounted.code == "gravity-direction"
@@ -81,7 +86,8 @@ def test_what_was_found_is_said_with_the_option_to_write():
     assert joints[1] in sentence(missing) and gravity_findings(said(STATED, masses=True), joints) == []
 
 
-def test_axes_along_the_vertical_tell_nothing():
+def test_vertical_axes_tell_nothing():
+    """Axes along the vertical tell nothing."""
     chain = planted.arm()
     assert chain.n == 3
     t, q, v, a = planted.motion(0)
@@ -93,7 +99,8 @@ def test_axes_along_the_vertical_tell_nothing():
     assert not gravity_of([MotionSamples(np.arange(len(q)), q, v, a, torques, v, bodies)], chain).refuted
 
 
-def test_exchanged_torque_columns_are_named_without_masses():
+def test_exchanged_columns_need_no_masses():
+    """Exchanged torque columns are named without masses."""
     chain = load("lwr4plus")
     t = np.arange(0.0, 20.0, 0.04)
     q, v, a = sines(t, chain.n, np.random.default_rng(1))

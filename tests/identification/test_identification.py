@@ -26,13 +26,15 @@ def errors(found) -> np.ndarray:
 
 
 @pytest.mark.parametrize("method", [pytest.param("ols", marks=pytest.mark.slow), "wls", "irls"])
-def test_base_parameters_come_back_within_their_covariance(method):
+def test_base_parameters_within_covariance(method):
+    """Base parameters come back within their covariance."""
     settings = IdentificationSettings(friction="standard", method=method, essential="none")
     size = [errors(identify(planted.arm(), [planted.case("a", seed)], settings)) for seed in range(5)]
     assert 0.5 < np.mean(size) < 2.0
 
 
-def test_prediction_of_other_motion_is_as_good_as_the_noise():
+def test_prediction_is_as_good_as_the_noise():
+    """Prediction of other motion is as good as the noise."""
     found = identify(planted.arm(), [planted.case("a", 0)], PLAIN)
     other = planted.case("b", 1)
     scored = score(other, predict(found.dynamics, other))
@@ -54,7 +56,8 @@ def test_nothing_is_added_to_a_plain_robot():
         pytest.param("asymmetric", (friction.term("Fva2", "speed", 1),), 0.5, marks=pytest.mark.slow),
     ],
 )
-def test_the_ladder_takes_what_is_planted_and_only_there(name, terms, size):
+def test_ladder_takes_what_is_planted_alone(name, terms, size):
+    """The ladder takes what is planted, and only where it is planted."""
     values = {one.name: size for one in terms}
     found = identify(planted.arm(), [planted.case("a", 0, terms=terms, values=values)])
     rungs = {rung.model: rung for rung in found.friction.steps if rung.kept}
@@ -65,14 +68,16 @@ def test_the_ladder_takes_what_is_planted_and_only_there(name, terms, size):
     assert two < 0.8 * one
 
 
-def test_a_named_rung_is_taken_at_all_joints_whatever_it_brings():
+def test_named_rung_is_taken_at_all_joints():
+    """A named rung is taken at all joints, whatever it brings."""
     found = identify(planted.arm(), [planted.case("a", 0)], IdentificationSettings(friction="asymmetric"))
     assert [one.name for one in found.friction.terms] == ["Fva1", "Fva2", "Fva3"]
     with pytest.raises(UsageError, match="friction 'stribek' is not one of"):
         select_friction(FrictionCandidates([], [], [], None, *[np.zeros(0)] * 4), "stribek")  # type: ignore[arg-type]
 
 
-def test_gains_come_from_a_payload_of_known_mass():
+def test_gains_come_from_known_payload():
+    """Gains come from a payload of known mass."""
     gains, arm = np.array([8.0, 12.0, 5.0]), planted.arm()
     settings = IdentificationSettings(payloads={"load": Payload(2.0)})
     cases = [planted.case("u", 0, gains=gains, noise=0.1), planted.case("l", 0, ("load",), gains=gains, noise=0.1)]
@@ -91,7 +96,8 @@ def test_gains_come_from_a_payload_of_known_mass():
         identify_gains(data, {})
 
 
-def test_a_payload_that_only_unseen_motion_carries_counts_with_its_stated_mass_and_centre():
+def test_payload_of_unseen_motion_counts():
+    """A payload that only unseen motion carries counts with its stated mass and centre."""
     loaded, errors = planted.case("b", 1, ("load",)), {}
     for payload in (Payload(2.0, (0.05, 0.025, 0.1)), Payload(2.0)):
         settings = IdentificationSettings(friction="standard", payloads={"load": payload})
@@ -115,7 +121,8 @@ def one_sine(name: str = "s"):
     return make_case(name, make_motion(recording, FilterOptions(cutoff=20.0, band=5.0)))
 
 
-def test_one_sine_is_drawn_to_cad_and_says_so():
+def test_one_sine_is_drawn_to_cad():
+    """The estimate from one sine is drawn to the CAD, and says so."""
     found = identify(planted.arm(), [one_sine()])
     assert found.prior is not None and found.prior.source == "cad" and found.friction.terms == ()
     values = dict(zip(found.names, found.fitted.estimate.values))
@@ -143,7 +150,8 @@ def test_a_term_from_the_options_is_found():
     assert estimate.values[k] == pytest.approx(15.0, abs=4 * estimate.sigma[k])
 
 
-def test_a_long_recording_keeps_its_band_and_loses_rows():
+def test_long_recording_loses_rows_not_band():
+    """A long recording keeps its band and loses rows."""
     cases = [planted.case("train", 0)]
     all_of_them = common_decimator(cases, IdentificationSettings())
     few = common_decimator(cases, IdentificationSettings(samples=100))
@@ -157,7 +165,8 @@ def test_a_long_recording_keeps_its_band_and_loses_rows():
     np.testing.assert_allclose(part.target, full.target[::step], atol=1e-12)
 
 
-def test_a_prediction_is_the_regressor_times_the_parameters():
+def test_prediction_is_regressor_product():
+    """A prediction is the regressor times the parameters."""
     case, model = planted.case("train", 0), planted.model()
     values = planted.truth()
     motion = case.motion

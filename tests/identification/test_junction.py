@@ -33,7 +33,8 @@ def geometry(model: str) -> kinematic.Outcome:
 
 
 @pytest.mark.parametrize("model", ["geometry", pytest.param("harmonics", marks=pytest.mark.slow)])
-def test_fit_and_identification_in_one_process_equal_the_way_through_files(model, tmp_path):
+def test_one_process_equals_way_by_files(model, tmp_path):
+    """Fit and identification in one process equal the way through files."""
     outcome = geometry(model)
     robot = outcome.robot
     log = planted.write(tmp_path, "log.npz", 0)
@@ -59,7 +60,8 @@ def test_fit_and_identification_in_one_process_equal_the_way_through_files(model
     )
 
 
-def test_a_calibrated_robot_reads_back_as_it_was_written(tmp_path):
+def test_calibrated_robot_reads_back(tmp_path):
+    """A calibrated robot reads back as it was written."""
     robot = geometry("harmonics").robot
     assert robot.corrections is not None and robot.nominal is not None and robot.moved
     calibrated.write(tmp_path, robot)
@@ -73,7 +75,8 @@ def test_a_calibrated_robot_reads_back_as_it_was_written(tmp_path):
     np.testing.assert_allclose(again.covariance, robot.covariance, rtol=1e-11)
 
 
-def test_a_geometry_good_only_with_its_corrections_is_not_taken_for_a_robot():
+def test_corrected_geometry_is_no_robot():
+    """A geometry good only with its corrections is not taken for a robot."""
     found = geometry("harmonics").selection.fit
     with pytest.raises(UsageError, match="needs the best fit without corrections"):
         calibrated_chain(found)

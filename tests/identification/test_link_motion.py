@@ -69,7 +69,8 @@ def error(found: Identification, case: Case) -> float:
     return float(100.0 * np.linalg.norm(left) / np.linalg.norm(target))
 
 
-def test_the_links_motion_is_the_motors_plus_the_deflection_and_its_derivatives():
+def test_link_moves_as_motor_and_deflection():
+    """The link's motion is the motor's plus the deflection and its derivatives."""
     case = with_link_motion(robot(), soft(1), SETTINGS)
     motion, rate = case.motion, case.motion.rate
     q, v, a = (moved - own for moved, own in zip(case.links, (motion.q, motion.v, motion.a)))
@@ -83,7 +84,7 @@ def test_the_links_motion_is_the_motors_plus_the_deflection_and_its_derivatives(
     assert with_link_motion(robot().without_corrections(), soft(1), SETTINGS).link is None
 
 
-def test_torques_of_other_motion_are_predicted_better_where_the_links_deflect():
+def test_deflection_improves_prediction():
     """Measured: 0.29 % rigid, 0.09 % with the springs; of the wrong sign 0.64 %."""
     errors = []
     for arm in (robot().without_corrections(), robot(), robot(1.0 / STIFFNESS)):
@@ -92,7 +93,7 @@ def test_torques_of_other_motion_are_predicted_better_where_the_links_deflect():
     assert errors[1] < 0.5 * errors[0] and errors[2] > 1.5 * errors[0]
 
 
-def test_the_sensitivity_to_a_stiffness_is_the_two_sided_difference_of_refits():
+def test_stiffness_slope_is_that_of_refits():
     """Measured: 0.3 % off."""
     step = 0.02 / STIFFNESS[1] * np.eye(3)[1]
 
@@ -110,7 +111,8 @@ def test_the_sensitivity_to_a_stiffness_is_the_two_sided_difference_of_refits():
     np.testing.assert_allclose(carried.sigma_geometry, 1e-5 * np.linalg.norm(slopes, axis=1), rtol=1e-9)
 
 
-def test_identified_masses_of_the_springs_torques_survive_the_file(tmp_path):
+def test_masses_of_springs_survive_the_file(tmp_path):
+    """Identified masses of the springs' torques survive the file."""
     whole = robot(sigma=1e-5)
     heavier = replace(planted.arm(), inertias=1.2 * planted.INERTIAS)
     bending = replace(whole.corrections, deflection=replace(whole.deflection, reference=heavier))

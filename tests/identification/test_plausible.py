@@ -48,13 +48,15 @@ def coded(found: list[Finding], *codes: str) -> list[Finding]:
     return [one for one in found if one.code in codes]
 
 
-def test_a_sound_recording_is_not_remarked_upon() -> None:
+def test_sound_recording_is_not_remarked() -> None:
+    """A sound recording is not remarked upon."""
     sizes = compare_sizes(case_of(recorded()), ARM)
     assert findings([sizes], NAMES) == []
     assert sizes.masses[1] == pytest.approx(1.0, abs=0.15) and sizes.speed == pytest.approx(1.0, abs=1e-3)
 
 
-def test_torques_against_the_robots_own_masses_fail() -> None:
+def test_torques_against_own_masses_fail() -> None:
+    """Torques against the robot's own masses fail."""
     (one,) = found(recorded(), gravity=(0.0, 0.0, 9.81))
     assert (one.code, level_of(one)) == ("torques-against-masses", "fail") and "joint2" in one.values["joints"]
 
@@ -71,7 +73,8 @@ def test_one_joint_in_another_unit_is_named(joint: int) -> None:
 
 
 @pytest.mark.parametrize("factor, level", [(1.0, None), (2.0, "marginal"), (10.0, "fail")])
-def test_a_gain_that_takes_a_joint_beyond_its_limit_is_told(factor: float, level: str | None) -> None:
+def test_gain_beyond_joint_limit_is_told(factor: float, level: str | None) -> None:
+    """A gain that takes a joint beyond its limit is told."""
     usual = np.quantile(np.abs(recorded().effort[:, 2]), 0.99)
     arm = replace(ARM, joints=(*ARM.joints[:2], replace(ARM.joints[2], effort=1.1 * usual)))
     case = case_of(recorded(tau=recorded().effort * [1.0, 1.0, factor]))
@@ -80,13 +83,15 @@ def test_a_gain_that_takes_a_joint_beyond_its_limit_is_told(factor: float, level
     assert all(one.values["joints"][0].startswith("joint3 ") for one in told)
 
 
-def test_torques_that_reach_no_share_of_any_limit_are_another_unit() -> None:
+def test_tiny_torques_are_another_unit() -> None:
+    """Torques that reach no share of any limit are another unit."""
     (one,) = coded(found(recorded(tau=1e-3 * recorded().effort)), "torques-below-limits")
     assert level_of(one) == "marginal" and one.values["share"] < 0.01
 
 
 @pytest.mark.parametrize("factor, level", [(1.5, None), (2.6, "marginal"), (4.0, "fail"), (0.2, "fail")])
-def test_torques_of_another_robot_are_told_by_their_size(factor: float, level: str | None) -> None:
+def test_torques_of_another_robot_are_told(factor: float, level: str | None) -> None:
+    """Torques of another robot are told by their size."""
     told = coded(found(recorded(tau=factor * recorded().effort)), "torques-unlike-masses")
     assert [level_of(one) for one in told] == ([level] if level else [])
 
@@ -94,14 +99,16 @@ def test_torques_of_another_robot_are_told_by_their_size(factor: float, level: s
 @pytest.mark.parametrize(
     "clock, level", [(1.01, None), (1.03, "marginal"), (1.1, "marginal"), (2.0, "fail"), (0.5, "fail")]
 )
-def test_velocities_that_are_no_slopes_are_told(clock: float, level: str | None) -> None:
+def test_velocities_unlike_slopes_are_told(clock: float, level: str | None) -> None:
+    """Velocities that are no slopes are told."""
     told = coded(found(recorded(clock=clock)), "velocities-scaled")
     assert [level_of(one) for one in told] == ([level] if level else [])
     assert all(one.values["size"] == pytest.approx(max(clock, 1 / clock), rel=2e-3) for one in told)
 
 
 @pytest.mark.parametrize("late", [0.0, 0.005, 0.02, 0.05, -0.05, 0.1, 0.2])
-def test_a_lag_of_all_torques_is_found_and_taken_back(late: float) -> None:
+def test_lag_of_all_torques_is_taken_back(late: float) -> None:
+    """A lag of all torques is found and taken back."""
     sizes = compare_sizes(case_of(recorded(late)), ARM)
     lag, told = sizes.lag, coded(findings([sizes], NAMES), "torques-late")
     assert lag is not None and lag.seconds == pytest.approx(late, abs=0.001) and lag.certain == (abs(late) > 0.015)
@@ -124,7 +131,8 @@ def bending(t: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("late", [0.0, 0.05])
-def test_friction_that_turns_over_late_is_no_lag(late: float) -> None:
+def test_late_friction_is_no_lag(late: float) -> None:
+    """Friction that turns over late is no lag."""
     t, q, v, a = planted.motion(0)
     tau = planted.torques(q, v, a) + np.array(planted.DRIVES["Fc"]) * (bending(t, v) - np.sign(v))
     tau = np.column_stack([np.interp(t - late, t, own) for own in tau.T])
@@ -132,7 +140,8 @@ def test_friction_that_turns_over_late_is_no_lag(late: float) -> None:
     assert lag is not None and lag.seconds == pytest.approx(late, abs=0.008) and lag.certain == (late > 0)
 
 
-def test_halves_that_disagree_and_short_motion_tell_no_lag() -> None:
+def test_disagreeing_halves_tell_no_lag() -> None:
+    """Halves that disagree, and short motion, tell no lag."""
     late, early = recorded(0.1).effort, recorded(-0.02).effort
     tau = np.where(recorded().t[:, None] < 10.0, late, early)
     lag = compare_sizes(case_of(recorded(tau=tau)), ARM).lag
@@ -140,7 +149,8 @@ def test_halves_that_disagree_and_short_motion_tell_no_lag() -> None:
     assert compare_sizes(case_of(recorded(0.1).cut(2.0, 4.5)), ARM).lag is None
 
 
-def test_one_joint_that_comes_late_is_no_clock_and_named() -> None:
+def test_one_late_joint_is_named() -> None:
+    """One joint that comes late is no clock, and is named."""
     tau = recorded().effort.copy()
     tau[:, 2] = recorded(0.05).effort[:, 2]
     sizes = compare_sizes(case_of(recorded(tau=tau)), ARM)
@@ -151,14 +161,16 @@ def test_one_joint_that_comes_late_is_no_clock_and_named() -> None:
     assert one.values["way"] == "later" and one.values["by"] == pytest.approx(0.049, abs=5e-4)
 
 
-def test_a_finding_holds_the_verdict_until_it_is_accepted() -> None:
+def test_finding_waits_to_be_accepted() -> None:
+    """A finding holds the verdict until it is accepted."""
     wrong = finding("torques-against-masses", file="log", joints=["joint2"])
     held = Verdict.of("5 %", [wrong])
     assert (held.level, held.code) == ("fail", wrong.code)
     assert Verdict.of("5 %", settle([wrong], ("masses",))) == Verdict("pass", "5 %")
 
 
-def test_torques_beyond_all_limits_are_another_unit() -> None:
+def test_huge_torques_are_another_unit() -> None:
+    """Torques beyond all limits are another unit."""
     joints = Joints(NAMES, effort=np.full(3, 60.0))
     check_recording(recorded(), joints)
     with pytest.raises(MeasurementError, match="N mm"):
@@ -169,7 +181,8 @@ def test_torques_beyond_all_limits_are_another_unit() -> None:
 
 @pytest.mark.parametrize("spike", [100.0, 1e5, 1e300])
 @pytest.mark.parametrize("limit", [60.0, np.inf])
-def test_a_spike_of_a_torque_is_left_out_with_its_row_and_many_are_refused(spike: float, limit: float) -> None:
+def test_spike_is_dropped_and_many_refused(spike: float, limit: float) -> None:
+    """A spike of a torque is left out with its row, and many are refused."""
     joints, log = Joints(NAMES, effort=np.full(3, limit)), recorded()
     spiked = log.effort.copy()
     spiked[7, 1] = spike
@@ -186,12 +199,14 @@ def test_a_spike_of_a_torque_is_left_out_with_its_row_and_many_are_refused(spike
             check_recording(recorded(tau=spiked), joints)
 
 
-def test_currents_without_gains_compare_with_no_masses() -> None:
+def test_currents_compare_with_no_masses() -> None:
+    """Currents without gains compare with no masses."""
     one = replace(case_of(recorded()), target=5.0 * case_of(recorded()).target)
     assert np.isnan(compare_sizes(one, ARM, newtons=False).masses).all()
 
 
-def test_an_encoder_that_jumps_is_named_with_its_rows_and_holds_the_verdict() -> None:
+def test_jumping_encoder_is_named_with_rows() -> None:
+    """An encoder that jumps is named with its rows, and holds the verdict."""
     assert check_recording(recorded()).jumps == ()
     q = recorded().q.copy()
     q[2000:, 2] += 0.05
@@ -225,7 +240,8 @@ def test_exchanged_joints_are_named() -> None:
     assert level_of(told) == "marginal" and told.values["joints"] == ("joint2", "joint3")
 
 
-def test_a_right_angle_at_a_joints_zero_is_named_and_no_exchange_is_told_in_its_place() -> None:
+def test_right_angle_at_zero_is_no_exchange() -> None:
+    """A right angle at a joint's zero is named, and no exchange is told in its place."""
     turned = recorded().q + np.array([0.0, np.pi / 2, 0.0])
     (told,) = coded(found(replace(recorded(), q=turned, v=None)), "zero-elsewhere", "columns-exchanged")
     assert (level_of(told), told.values["joints"]) == ("marginal", ("joint2",))
@@ -233,7 +249,7 @@ def test_a_right_angle_at_a_joints_zero_is_named_and_no_exchange_is_told_in_its_
 
 
 @pytest.mark.parametrize("reverse", [(), (0,), (1,), (2,), (0, 2)])
-def test_joints_of_reversed_sign_are_named_and_no_others(reverse: tuple[int, ...]) -> None:
+def test_reversed_joints_alone_are_named(reverse: tuple[int, ...]) -> None:
     """Whether the robot's own masses are known or not."""
     signs = np.where(np.isin(np.arange(3), reverse), -1.0, 1.0)
     case = case_of(recorded(tau=recorded().effort * signs))
@@ -253,14 +269,15 @@ def test_joints_of_reversed_sign_are_named_and_no_others(reverse: tuple[int, ...
         (0.02, 0.9, "zero-elsewhere", False),
     ],
 )
-def test_a_change_that_leaves_the_torques_unexplained_is_not_told(left, factor, code, told) -> None:
+def test_change_without_gain_is_not_told(left, factor, code, told) -> None:
+    """A change that leaves the torques unexplained is not told."""
     change = Change(code, lambda samples: samples, (1, 0), {"angle": np.pi})
     other = Explanation((change,), np.array([left / factor**2]), np.array([left]))
     assert bool(findings([replace(compare_sizes(case_of(recorded()), ARM), other=other)], NAMES)) == told
 
 
 @pytest.mark.parametrize("way", [1.0, -1.0])
-def test_a_joint_that_counts_from_the_one_before_it_is_named(way: float) -> None:
+def test_joint_counting_from_last_is_named(way: float) -> None:
     """Whether the robot's own masses are known or not."""
     log = recorded()
     case = case_of(replace(log, q=log.q - way * log.q[:, [0, 1, 1]] * [0.0, 0.0, 1.0], v=None))
@@ -283,7 +300,8 @@ def logged(clock: float = 1.0, speed: float | np.ndarray = 1.0) -> Recording:
 
 
 @pytest.mark.parametrize("clock, speed", [(1.0, 0.9), (1.0, 1.1), (1.0, 2.0), (2.0, 1.0), (0.9, 1.0), (0.1, 1.0)])
-def test_counted_dates_that_contradict_the_stamps_are_told_with_both_rates(clock: float, speed: float) -> None:
+def test_contradicting_dates_have_both_rates(clock: float, speed: float) -> None:
+    """Counted dates that contradict the stamps are told with both rates."""
     case = case_of(logged(clock, speed)) if clock != 0.1 else make_case("log", make_motion(logged(clock, speed)))
     assert case.motion.sampling.clock.kind == "counted" and case.motion.rate * clock == pytest.approx(200.0, rel=0.01)
     (one,) = coded(findings([compare_sizes(case, ARM)], NAMES), "velocities-scaled", "velocities-unlike-positions")
@@ -292,7 +310,8 @@ def test_counted_dates_that_contradict_the_stamps_are_told_with_both_rates(clock
     assert one.values["counted"] == pytest.approx(200.0 * speed, rel=0.01)
 
 
-def test_inertias_beside_masses_say_whether_stamps_or_velocities_are_wrong() -> None:
+def test_inertias_tell_stamps_or_velocities() -> None:
+    """Inertias beside masses say whether stamps or velocities are wrong."""
     v = recorded().v
     assert v is not None
     for one, against in ((recorded(clock=2.0), "stamps"), (recorded(v=2.0 * v), "velocities")):
@@ -300,7 +319,8 @@ def test_inertias_beside_masses_say_whether_stamps_or_velocities_are_wrong() -> 
         assert (told.code, level_of(told)) == ("velocities-scaled", "fail") and told.values["against"] == against
 
 
-def test_counted_dates_are_the_velocities_where_that_is_asked_for_and_agree_where_nothing_is_wrong() -> None:
+def test_counted_dates_agree_where_right() -> None:
+    """Counted dates follow the velocities where that is asked for, and agree where nothing is wrong."""
     assert found(logged()) == []
     asked = make_motion(logged(2.0), FilterOptions(cutoff=30.0, band=10.0, clock="counted"))
     assert asked.rate == pytest.approx(200.0, rel=0.01)
@@ -308,7 +328,8 @@ def test_counted_dates_are_the_velocities_where_that_is_asked_for_and_agree_wher
     assert float(note.split()[-1]) == pytest.approx(0.5, rel=0.01)
 
 
-def test_velocities_that_do_not_follow_the_positions_are_noted() -> None:
+def test_inconsistent_velocities_are_noted() -> None:
+    """Velocities that do not follow the positions are noted."""
     v, noise = recorded().v, np.random.default_rng(1).normal(size=(len(recorded()), 3))
     assert v is not None
     for wrong, backwards, others in (
@@ -319,7 +340,7 @@ def test_velocities_that_do_not_follow_the_positions_are_noted() -> None:
         assert one.values["others"][: len(others)] == others
 
 
-def test_a_motion_too_short_to_compare_velocities_is_not_remarked_upon() -> None:
+def test_short_motion_is_not_remarked_upon() -> None:
     """A date wrong by 1 % moves a joint by that share of its travel, of which little is left beside a trend."""
     long, short = (compare_sizes(case_of(one), ARM) for one in (recorded(), recorded().cut(2.0, 3.6)))
     assert short.speed_sigma.max() > 2.0 * long.speed_sigma.max() and long.speed_sigma.max() < 0.012
@@ -342,7 +363,8 @@ def away(recording: Recording) -> Contradiction:
     return far
 
 
-def test_an_estimate_far_from_every_possible_robot_fails_and_one_with_other_friction_is_not_remarked() -> None:
+def test_estimate_far_from_possible_fails() -> None:
+    """An estimate far from every possible robot fails, and one with other friction is not remarked upon."""
     sound = away(recorded())
     assert sound.distance < sound.allowed and impossible(sound) == []
     bent = away(recorded(tau=recorded().effort + 5.0 * np.sin(3.0 * recorded().q)))
@@ -352,14 +374,16 @@ def test_an_estimate_far_from_every_possible_robot_fails_and_one_with_other_fric
     assert level_of(settle([one], ["bodies"])[0]) == "note"
 
 
-def test_a_contradiction_is_remarked_by_its_size() -> None:
+def test_contradiction_is_judged_by_its_size() -> None:
+    """A contradiction is remarked upon by its size."""
     far = (impossible(Contradiction(10.0 * times, 10.0, 3.0)) for times in (4.0, 6.0, 12.0))
     levels = [[level_of(one) for one in found] for found in far]
     assert levels == [[], ["marginal"], ["fail"]] and impossible(None) == []
     assert impossible(Contradiction(120.0, 10.0, 0.1)) == []
 
 
-def test_a_description_that_cannot_be_allows_no_pass():
+def test_impossible_description_cannot_pass():
+    """A description that cannot exist allows no pass."""
     chain = load("lwr4plus")
     assert described(chain) == []
     bodies = np.array(chain.inertias)
@@ -371,7 +395,7 @@ def test_a_description_that_cannot_be_allows_no_pass():
 
 
 @pytest.mark.parametrize("clock, level", [(1.0, None), (0.5, "fail"), (3.0, "fail")])
-def test_a_description_with_masses_tells_the_clock_where_lengths_do_not(clock: float, level: str | None) -> None:
+def test_masses_tell_clock_beyond_lengths(clock: float, level: str | None) -> None:
     """BIRDy's TX40 has half the inertia that rods of its lengths would have."""
     arm = load("tx40")
     speed = np.array([joint.velocity for joint in arm.joints])

@@ -29,7 +29,7 @@ def motion(t: np.ndarray, n: int, seed: int = 0):
     return q, v, -np.sum((a * w**2)[:, None] * np.sin(angle), axis=0)
 
 
-def test_the_energies_derivative_is_the_power():
+def test_energy_derivative_is_the_power():
     """Of every column: bodies, rotors, a rotor that two joints share; under gravity, with prismatic joints."""
     n = motley().n
     t = np.linspace(0.0, 1.0, 4001)
@@ -40,7 +40,7 @@ def test_the_energies_derivative_is_the_power():
     assert np.allclose(rising, power, rtol=0, atol=1e-5 * np.abs(power).max())
 
 
-def test_power_identifies_an_arm_without_accelerations_each_recording_with_its_own_weight():
+def test_power_needs_no_accelerations():
     """Base parameters within their sigmas, from two recordings one of which is ten times as noisy."""
     n, away = motley().n, []
     own = model(n, "Ia Fv")

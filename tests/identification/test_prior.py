@@ -37,7 +37,8 @@ def test_a_second_of_motion_is_held_by_it():
     assert drawn < bare and drawn < 0.3
 
 
-def test_a_cad_that_is_asked_for_has_to_be_there():
+def test_requested_cad_has_to_be_there():
+    """A CAD that is asked for has to be there."""
     blind = replace(planted.arm(), inertias=None)
     with pytest.raises(UsageError, match="no masses"):
         identify(blind, [planted.case("a", 0)], replace(PLAIN, prior="cad"))

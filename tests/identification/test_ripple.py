@@ -42,7 +42,8 @@ def explained(one: ripple.Ripple, where: GearTravel, torque: np.ndarray) -> floa
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
-def test_family_is_found_and_predicts_other_motion(seed):
+def test_ripple_predicts_other_motion(seed):
+    """The family of waves is found, and predicts other motion."""
     learnt, other = track(seed), track(seed + 100)
     noise = np.random.default_rng(seed).normal(scale=0.2, size=learnt.q.shape)
     torque = planted(learnt) + noise
@@ -63,13 +64,15 @@ def test_noise_has_no_ripple(seed):
     assert [ripple.find(joint, learnt, noise[:, joint], turns) for joint in (0, 1)] == [None, None]
 
 
-def test_joints_that_hardly_move_have_no_ripple_to_be_found():
+def test_hardly_moving_joints_have_no_ripple():
+    """Joints that hardly move have no ripple to be found."""
     case = planted_motion.case("still", 0, duration=4.0)
     still = replace(case, motion=replace(case.motion, q=frozen(1e-3 * case.motion.q)))
     assert ripple.find_all([still], [np.array(case.target)]) == []
 
 
-def test_a_single_loud_moment_has_no_coherence():
+def test_single_loud_moment_is_incoherent():
+    """A single loud moment has no coherence."""
     learnt = track(0)
     burst = np.where(learnt.block == 3, np.sin(200.0 * learnt.q[:, 0]), 0.0)
     steady = np.sin(200.0 * learnt.q[:, 0])

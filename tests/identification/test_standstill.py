@@ -76,7 +76,7 @@ def in_motion(found: Identification, case: Case) -> float:
     return score(case, predict(found.dynamics, case)).moving.total
 
 
-def test_friction_comes_back_from_a_recording_that_stands_for_a_third(monkeypatch):
+def test_friction_returns_despite_standing(monkeypatch):
     """With standing rows as any others it is several times as wrong, and so is motion that the fit has not seen."""
     cases, other = [stop_and_go(seed) for seed in range(3)], stop_and_go(7)
     counted = [identify(planted.arm(), [case], PLAIN) for case in cases]
@@ -87,7 +87,8 @@ def test_friction_comes_back_from_a_recording_that_stands_for_a_third(monkeypatc
     assert unseen < before
 
 
-def test_estimates_are_within_their_covariance_where_joints_stand():
+def test_estimates_hold_where_joints_stand():
+    """Estimates are within their covariance where joints stand."""
     size = []
     for seed in range(4):
         found = identify(planted.arm(), [stop_and_go(seed)], replace(PLAIN, prior="none"))
@@ -98,7 +99,8 @@ def test_estimates_are_within_their_covariance_where_joints_stand():
     assert 0.4 < np.mean(size) < 2.0
 
 
-def test_a_standstill_weighs_as_one_row_of_its_friction_however_long_it_lasts():
+def test_standstill_weighs_as_one_row():
+    """A standstill weighs as one row of its friction, however long it lasts."""
     rows = rows_of(stop_and_go(0))
     parts = divided(rows)
     np.testing.assert_allclose(parts.standstills, len(PAUSES))
@@ -116,7 +118,7 @@ def test_a_standstill_weighs_as_one_row_of_its_friction_however_long_it_lasts():
     assert (frictions < 1.5 * len(PAUSES)).all(), "nothing moves, so that the torque hardly changes"
 
 
-def test_a_standstill_whose_load_changes_counts_once_again_for_each_reach_of_the_friction():
+def test_changed_load_counts_standstill_anew():
     """What other joints do to a standing one is seen beyond the width of its friction."""
     rows = rows_of(stop_and_go(0))
     values, std, tau = np.zeros(rows[0].matrix.shape[2]), np.full(3, 0.05), np.full(3, 2.0)
@@ -135,7 +137,8 @@ def test_a_standstill_whose_load_changes_counts_once_again_for_each_reach_of_the
     ), rtol=1e-6)  # fmt: skip
 
 
-def test_without_friction_a_standstill_weighs_as_all_its_rows():
+def test_frictionless_standing_has_all_rows():
+    """Without friction a standstill weighs as all its rows."""
     parts = divided(rows_of(stop_and_go(0)))
     standing = replace(parts.standing, factors=np.zeros_like(parts.standing.factors))
     weights = replace(parts, standing=standing).weights(np.zeros(parts.moving.parameters), np.ones(3), np.full(3, 5.0))
@@ -144,12 +147,14 @@ def test_without_friction_a_standstill_weighs_as_all_its_rows():
     np.testing.assert_allclose(frictions * weights.count, parts.length)
 
 
-def test_motion_without_standstill_keeps_all_its_rows():
+def test_uninterrupted_motion_has_all_rows():
+    """Motion without standstill keeps all its rows."""
     part = rows_of(planted.case("a", 0))[0]
     assert not part.standing.any() and (part.weight == part.present).all()
 
 
-def test_coulomb_columns_are_zero_at_rest_and_no_others():
+def test_only_coulomb_columns_vanish_at_rest():
+    """Coulomb columns are zero at rest, and no others."""
     case = stop_and_go(0)
     rows, plain = rows_of(case)[0], observe(*_observed(case))
     rests = rows.standing > 0.0
@@ -165,13 +170,14 @@ def _observed(case: Case):
 
 
 @pytest.mark.parametrize("drives", ["Ia Fv off", ""])
-def test_drives_without_coulomb_friction_have_no_standstills(drives):
+def test_no_coulomb_drives_no_standstills(drives):
     """Direct drives, say: at rest their torque is as determined as in motion."""
     part = rows_of(stop_and_go(0), replace(PLAIN, sets=(drives,)) if drives else PLAIN)[0]
     assert part.standing.any() == (not drives)
 
 
-def test_a_joint_that_never_moves_keeps_its_rows():
+def test_joint_that_never_moves_keeps_rows():
+    """A joint that never moves keeps its rows."""
     case = stop_and_go(0)
     motion = case.motion
     moves = np.arange(3) != 1
@@ -180,7 +186,8 @@ def test_a_joint_that_never_moves_keeps_its_rows():
     assert not standing[:, 1].any() and standing[:, [0, 2]].any(axis=0).all()
 
 
-def test_intervals_have_two_widths_and_hold_in_both():
+def test_intervals_have_two_widths():
+    """Intervals have two widths and hold in both."""
     covered = []
     for seed in range(3):
         train = [stop_and_go(seed)]
@@ -194,12 +201,14 @@ def test_intervals_have_two_widths_and_hold_in_both():
     assert 0.92 < moving <= 1.0 and resting > 0.85
 
 
-def test_cut_slow_is_refused_with_what_replaced_it():
+def test_cut_slow_names_its_replacement():
+    """The option cut_slow is refused, with what replaced it."""
     with pytest.raises(UsageError, match="cut_slow: standing rows are no longer cut"):
         parse_options({"cut_slow": True})
 
 
-def test_left_out_motion_does_not_ask_for_standing_rows_where_friction_holds_them():
+def test_dropped_motion_asks_for_no_rows():
+    """Left-out motion does not ask for standing rows where friction holds them."""
     case = stop_and_go(3)
     rows = rows_of(case)
     first = first_fit(rows)
@@ -215,7 +224,7 @@ def test_left_out_motion_does_not_ask_for_standing_rows_where_friction_holds_the
 
 
 @pytest.mark.parametrize("reach", [0.0, 0.01])
-def test_rows_after_a_standstill_count_less_over_the_travel_in_which_its_friction_fades(reach):
+def test_fading_friction_lowers_later_rows(reach):
     """Friction at rest is random here; planted is how far it goes on while the joint moves away."""
     case = stop_and_go(4)
     decimator, torque_rows = common_decimator([case], PLAIN), make_model(planted.arm(), PLAIN).torque_rows
@@ -237,7 +246,8 @@ def test_rows_after_a_standstill_count_less_over_the_travel_in_which_its_frictio
     assert near.any() and weighed.breakaway[near].max() < 0.2 and weighed.breakaway[far].min() > 0.99
 
 
-def test_rows_before_any_standstill_are_as_others():
+def test_rows_before_a_standstill_are_normal():
+    """Rows before any standstill are as others."""
     case = planted.case("a", 0)
     (part,) = rows_of(case)
     decimator, torque_rows = common_decimator([case], PLAIN), make_model(planted.arm(), PLAIN).torque_rows

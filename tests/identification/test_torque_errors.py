@@ -43,7 +43,7 @@ def judged(found: Identification, model: TorqueErrorModel, case: Case) -> Torque
 
 
 @pytest.mark.parametrize("outside", [0.0, 1.0])
-def test_95_of_100_errors_on_other_motion_are_within_the_interval(outside):
+def test_interval_holds_95_of_100_errors(outside):
     """Over 2 x 5 pairs of motions, 20 s to learn from and to judge by; a single pair is known to a few percent only."""
     shares, unseen = [], [recorded(seed, outside) for seed in range(20, 25)]
     for seed in range(2):
@@ -52,7 +52,8 @@ def test_95_of_100_errors_on_other_motion_are_within_the_interval(outside):
     assert 0.93 < np.mean(shares) < 0.985
 
 
-def test_the_covariance_of_the_parameters_alone_would_be_far_too_small():
+def test_parameter_covariance_is_too_small():
+    """The covariance of the parameters alone would be far too small."""
     found, model = learnt(1.0)
     case = recorded(20, 1.0)
     motion, error = case.motion, np.abs(case.target - predict(found.dynamics, case))
@@ -60,7 +61,8 @@ def test_the_covariance_of_the_parameters_alone_would_be_far_too_small():
     assert np.mean(error < 1.96 * np.sqrt(alone)) < 0.7
 
 
-def test_faster_motion_than_learnt_is_named_and_its_errors_are_expected_to_be_larger():
+def test_faster_motion_expects_larger_errors():
+    """Faster motion than learnt is named, and its errors are expected to be larger."""
     found, model = learnt(1.0)
     motion = recorded(0, 1.0).motion
     rows = slice(0, len(motion), 50)
@@ -75,7 +77,8 @@ def test_faster_motion_than_learnt_is_named_and_its_errors_are_expected_to_be_la
     assert any(line.startswith("accelerating more than in training at joint a, b, c") for line in said)
 
 
-def test_several_recordings_and_exact_torques_give_intervals_too():
+def test_exact_torques_give_intervals_too():
+    """Several recordings and exact torques give intervals, too."""
     found, model = learnt(0.0, (0, 1, 2, 3), duration=10.0, noise=0.0)
     case = recorded(20, 0.0, noise=0.0)
     assert 0.0 < judged(found, model, case).median.max() < 0.3

@@ -22,7 +22,8 @@ def samples(seed: int, loaded: bool = False, friction: float = 0.0) -> MotionSam
 
 @pytest.mark.parametrize("count", [2, 3])
 @pytest.mark.parametrize("place", [0, 1])
-def test_the_loaded_recording_is_named_with_its_mass(count: int, place: int):
+def test_loaded_recording_is_named_with_mass(count: int, place: int):
+    """The loaded recording is named with its mass."""
     load = unstated_load({f"{seed}": samples(seed, loaded=seed == place) for seed in range(count)})
     assert load is not None and load.name == f"{place}"
     assert load.mass == pytest.approx(MASS, abs=4.0 * load.sigma) and load.sigma < 0.1 * MASS
@@ -40,12 +41,14 @@ def test_friction_of_another_day_is_no_load():
     assert unstated_load({"cold": samples(0, friction=3.0), "warm": samples(1)}) is None
 
 
-def test_torques_scaled_in_one_recording_are_no_load():
+def test_scaled_torques_are_no_load():
+    """Torques scaled in one recording are no load."""
     scaled = samples(1)
     assert unstated_load({"0": samples(0), "1": replace(scaled, effort=1.3 * scaled.effort)}) is None
 
 
-def test_a_mass_that_the_motion_does_not_tell_is_not_stated():
+def test_unseen_mass_is_not_stated():
+    """A mass that the motion does not tell is not stated."""
     still = []
     for taken in (samples(0), samples(1, loaded=True)):
         q, v, a = np.array(taken.q), np.array(taken.v), np.array(taken.a)

@@ -25,7 +25,8 @@ def averaged(**more: np.ndarray) -> dict[str, np.ndarray]:
     return {"variance_tau": np.tile(SINGLE**2, (count, 1)), "periods": np.array(PERIODS), **more}
 
 
-def test_the_reader_carries_the_variance_of_the_mean(tmp_path):
+def test_reader_carries_variance_of_mean(tmp_path):
+    """The reader carries the variance of the mean."""
     path = planted.write(tmp_path, "avg.npz", 0, **averaged())
     recording = read_recording(path)
     np.testing.assert_allclose(recording.effort_variance, SINGLE**2 / PERIODS)
@@ -33,7 +34,7 @@ def test_the_reader_carries_the_variance_of_the_mean(tmp_path):
     np.testing.assert_allclose(read_recording(f"{path}@2:9").effort_variance, SINGLE**2 / PERIODS)
 
 
-def test_weights_come_from_the_repeats_and_not_from_a_model_error():
+def test_weights_come_from_repeats_alone():
     """Joint 3's torque has a share the model lacks: its residuals grow, what the repeats say of it does not."""
     case = planted.case("a", 0, noise=0.05)
     wrong = np.array(case.target)
@@ -50,7 +51,8 @@ def test_weights_come_from_the_repeats_and_not_from_a_model_error():
 
 
 @pytest.mark.parametrize("prior", ["none", "cad"])
-def test_the_file_and_the_option_reach_the_weights(tmp_path, prior):
+def test_file_and_option_reach_the_weights(tmp_path, prior):
+    """The file and the option reach the weights."""
     recording = read_recording(planted.write(tmp_path, "avg.npz", 0, **averaged()))
     case = make_case("avg", make_motion(recording, FilterOptions(cutoff=30.0, band=10.0)), gains=np.array([1.0, -1, 2]))
     np.testing.assert_allclose(case.noise, SINGLE / np.sqrt(PERIODS) * [1.0, 1.0, 2.0])
@@ -63,7 +65,8 @@ def test_the_file_and_the_option_reach_the_weights(tmp_path, prior):
 @pytest.mark.parametrize(
     ("content", "method", "said"), [({}, "wls", "has no variances"), (averaged(), "ols", "needs method wls")]
 )
-def test_what_cannot_be_weighed_so_is_refused(robot, tmp_path, capsys, content, method, said):
+def test_unsuited_recordings_are_refused(robot, tmp_path, capsys, content, method, said):
+    """Recordings that cannot be weighed by their repeats are refused."""
     path, options = planted.write(tmp_path, "avg.npz", 0, **content), tmp_path / "options.toml"
     options.write_text('weights = "repeats"\nfriction = "standard"\n')
     out = tmp_path / "out"

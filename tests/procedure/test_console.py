@@ -16,7 +16,8 @@ def test_every_command_has_the_option():
     assert with_it == set(commands) - LISTINGS
 
 
-def test_without_it_details_go_and_warnings_stay(capsys):
+def test_quiet_console_drops_details_only(capsys):
+    """Without ``-v`` details go, and warnings stay."""
     app = typer.Typer()
 
     @command(app, "Start")

@@ -20,7 +20,8 @@ CODES = sorted(catalogue())
 
 
 @pytest.mark.parametrize("code", CODES)
-def test_an_entry_is_short_plain_and_complete(code):
+def test_entry_is_short_plain_and_complete(code):
+    """An entry is short, plain and complete."""
     entry = catalogue()[code]
     assert not re.search(PRIVATE, f"{entry.says} {entry.advice} {entry.means}")
     levels = {entry.level, *(level for steps in entry.limits.values() for level in steps)}
@@ -32,7 +33,7 @@ def test_an_entry_is_short_plain_and_complete(code):
         assert len(words.split()) <= 13, "a verdict has 25 words, figures included"
 
 
-def test_the_names_in_accept_are_those_of_the_catalogue():
+def test_accept_names_match_the_catalogue():
     """Each printed ``accept`` is taken by the options of the command that prints it, and these take no other."""
     text = Path(findings.__file__).with_suffix(".toml").read_text(encoding="utf-8")
     chapters = [set(re.findall('^accept = "(.+)"$', one, re.M)) for one in text.split("\n# ---- ")]
@@ -56,7 +57,8 @@ def test_every_entry_is_produced(pytestconfig):
     assert missing == []
 
 
-def test_every_finding_of_the_code_has_the_values_its_entry_needs():
+def test_findings_have_the_values_they_need():
+    """Every finding of the code has the values its entry needs."""
     made = {}
     for path in Path(findings.__file__).parents[1].rglob("*.py"):
         text = path.read_text(encoding="utf-8")
@@ -73,7 +75,8 @@ def test_every_finding_of_the_code_has_the_values_its_entry_needs():
         assert all(None in names or needed <= names for names in calls), code
 
 
-def test_a_level_is_the_mildest_of_its_limits_and_a_verdict_the_worst_of_its_findings():
+def test_level_is_mildest_and_verdict_worst():
+    """A level is the mildest of its limits, and a verdict the worst of its findings."""
     scale = dict(factor=1.01, sigma=1e-4)
     mild, none, sound = (
         finding("scale", off=off, explained=x, **scale) for off, x in ((1e-2, 0.5), (1e-2, 0.1), (0, 1))
@@ -92,7 +95,8 @@ def test_a_level_is_the_mildest_of_its_limits_and_a_verdict_the_worst_of_its_fin
     assert "a and 3 more" in sentence(worst)
 
 
-def test_a_part_without_its_value_is_left_out():
+def test_part_without_value_is_left_out():
+    """A part without its value is left out."""
     rank = dict(rank=3, parameters=4, tolerance=1e-6, last=0.1)
     assert "gap" in sentence(finding("rank", next=1e-9, **rank))
     assert "gap" not in sentence(finding("rank", next=None, **rank))
@@ -114,10 +118,12 @@ def test_the_glossary_is_plain_and_complete():
 
 
 @pytest.mark.parametrize("code", CODES)
-def test_an_explanation_shows_words_and_no_template(code):
+def test_explanation_shows_no_template(code):
+    """An explanation shows words, and no template."""
     text = findings.explain(code)
     assert not re.search(r"[{}<>]", text.replace("> ", "").replace("->", "")), text
 
 
-def test_values_of_a_template_are_named_in_capitals():
+def test_template_values_are_in_capitals():
+    """Values of a template are named in capitals."""
     assert findings.in_words("{rms:.3g mm} at {angle:.0f °}<, {rival_arm} too>") == "RMS mm at ANGLE°[, RIVAL ARM too]"

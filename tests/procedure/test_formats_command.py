@@ -46,7 +46,8 @@ def test_what_a_user_looks_for_is_there(calib, topic, words):
         assert word in out, word
 
 
-def test_limits_of_a_verdict_are_those_that_the_catalogue_prints(calib):
+def test_verdict_limits_match_the_catalogue(calib):
+    """Limits of a verdict are those that the catalogue prints."""
     assert "marginal where share > 10; fail where share > 30" in calib("explain", "torque-unexplained")[1]
 
 
@@ -75,7 +76,8 @@ def test_no_commands_summary_is_cut_off(calib, monkeypatch):
 
 
 @pytest.mark.parametrize("name", sorted(cli.command_tree().commands))
-def test_each_command_has_an_example_that_parses_and_no_type_of_python(calib, monkeypatch, name):
+def test_commands_have_parsing_examples(calib, monkeypatch, name):
+    """Each command has an example that parses, and no type of Python."""
     monkeypatch.setenv("COLUMNS", "60")
     shown, command = calib(name, "--help")[1], cli.command_tree().commands[name]
     (example,) = (line.split() for line in shown.splitlines() if line.startswith("  Example: "))
@@ -113,7 +115,7 @@ def _asked(line: str) -> dict[str, str]:
     return {"_CALIB_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(len(line.split()) - 1)}
 
 
-def test_a_console_without_unicode_gets_words(tmp_path):
+def test_console_without_unicode_gets_words(tmp_path):
     """Letters that an encoding lacks are spelt: sigma, ^2, +-; others get their number."""
     assert (
         "1 σ, 2 ± 0.1 µm, kg m², 3 °…, 中".encode("ascii", "spelt").decode()

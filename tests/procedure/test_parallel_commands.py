@@ -78,7 +78,8 @@ def calib(*words) -> int:
 
 
 @pytest.mark.parametrize("options", ["options", pytest.param("power", marks=pytest.mark.slow)])
-def test_identify_finds_the_payload_and_predicts_other_motion(folder, tmp_path, options):
+def test_identify_finds_payload_and_predicts(folder, tmp_path, options):
+    """Identify finds the payload, and predicts other motion."""
     out = tmp_path / "id"
     files = [folder / name for name in ("empty.csv", "load.csv")]
     words = ["--validate", folder / "other.csv", "--options", folder / f"{options}.toml", "--out", out, "--no-plots"]
@@ -107,7 +108,8 @@ def test_identify_finds_the_payload_and_predicts_other_motion(folder, tmp_path, 
 
 
 @pytest.mark.slow
-def test_fit_then_identify_on_the_calibrated_geometry(folder, tmp_path, capsys):
+def test_fit_then_identify(folder, tmp_path, capsys):
+    """Fit, then identify on the calibrated geometry."""
     fitted = tmp_path / "fit"
     assert calib("fit", "dualv", folder / "poses.csv", "--out", fitted) == 0
     metrics = json.loads((fitted / "metrics.json").read_text())
@@ -118,7 +120,8 @@ def test_fit_then_identify_on_the_calibrated_geometry(folder, tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_excite_writes_a_motion_within_the_limits(tmp_path):
+def test_excite_writes_motion_within_limits(tmp_path):
+    """Excite writes a motion within the limits."""
     out = tmp_path / "motion"
     words = ["--period", "1", "--harmonics", "3", "--starts", "1", "--evaluations", "8", "--no-outlook", "--drives"]
     assert calib("excite", "dualv", *words, "Fv Fc", "--out", out) == 0
@@ -135,7 +138,7 @@ def test_excite_writes_a_motion_within_the_limits(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_motion_after_an_identification_adds_its_information_under_both_loads(folder, tmp_path):
+def test_new_motion_adds_to_both_loads(folder, tmp_path):
     """Predicted σ are those of (C⁻¹ + ∫ Σ WᵀW / s²)⁻¹, W of the encoders' rows; a payload's come from its own run."""
     files, options = [folder / "empty.csv", folder / "load.csv"], folder / "options.toml"
     assert calib("identify", "dualv", *files, "--options", options, "--out", tmp_path / "id", "--no-plots") == 0
@@ -160,7 +163,8 @@ def test_a_motion_after_an_identification_adds_its_information_under_both_loads(
 
 
 @pytest.mark.parametrize("line", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_plan_keeps_the_limits_and_passes_the_waypoints(folder, tmp_path, line):
+def test_plan_keeps_limits_and_waypoints(folder, tmp_path, line):
+    """Plan keeps the limits, and passes the waypoints."""
     out = tmp_path / "plan"
     assert calib("plan", "dualv", "--waypoints", folder / "way.csv", "--out", out, *(["--line"] * line)) == 0
     metrics = json.loads((out / "metrics.json").read_text())
@@ -176,7 +180,8 @@ def test_the_api_fits_what_the_commands_fit(folder):
 
 
 @pytest.mark.slow
-def test_the_api_identifies_and_plans_as_the_commands_do(folder, tmp_path):
+def test_api_works_as_the_commands_do(folder, tmp_path):
+    """The API identifies and plans as the commands do."""
     robot = api.load("dualv")
     fitted = api.fit_geometry(robot, folder / "poses.csv", api.FitSettings(holdout=0.3))
     files = [folder / "empty.csv", folder / "load.csv"]
@@ -194,7 +199,8 @@ def test_the_api_identifies_and_plans_as_the_commands_do(folder, tmp_path):
         api.export(judged, tmp_path / "no", urdf=tmp_path / "robot.urdf")
 
 
-def test_the_api_chooses_no_poses_for_a_parallel_robot():
+def test_api_chooses_no_parallel_poses():
+    """The API chooses no poses for a parallel robot."""
     with pytest.raises(api.CalibError):
         api.select_poses(api.load("dualv"))
 
@@ -240,7 +246,8 @@ def test_what_is_wrong_is_said(folder, tmp_path, capsys, words, code, said):
     assert said in "".join(capsys.readouterr())
 
 
-def test_encoders_passive_joints_payloads_and_dropped_parameters_are_noted(folder, tmp_path):
+def test_unread_and_dropped_parts_are_noted(folder, tmp_path):
+    """Contradicting encoders, unread passive joints, uncarried payloads and dropped parameters are noted."""
     words = ["--options", folder / "dropped.toml", "--out", tmp_path, "--no-plots"]
     assert calib("identify", "dualv", folder / "shifted.csv", *words) == 0
     noticed = {one["code"]: one["values"] for one in json.loads((tmp_path / "metrics.json").read_text())["noticed"]}
@@ -248,6 +255,7 @@ def test_encoders_passive_joints_payloads_and_dropped_parameters_are_noted(folde
     assert noticed["needed-parameters-dropped"]["names"] == ["Fc11"]
 
 
-def test_parallel_robots_are_in_no_list_of_serial_arms():
+def test_parallel_robots_are_no_serial_arms():
+    """Parallel robots are in no list of serial arms."""
     parallel = parallel_robot.library()
     assert not set(parallel) & set(library.names()) and "dualv" in parallel

@@ -24,7 +24,8 @@ def names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
-def test_a_fit_without_plots_has_its_certificate_and_all_else(cell, calib, undrawn):
+def test_fit_without_plots_has_all_else(cell, calib, undrawn):
+    """A fit without plots has its certificate and all else."""
     measured = cell.write("m.csv", cell.measure())
     arguments = ("fit", "ur5", measured, "--holdout", 0.25, "--model", "geometry")
     assert calib(*arguments, "--out", "with")[0] == calib(*arguments, "--out", "without", "--no-plots")[0] == 0
@@ -38,11 +39,13 @@ def test_a_fit_without_plots_has_its_certificate_and_all_else(cell, calib, undra
     assert names(cell.folder / "with") == bare, "figures of the earlier fit are gone"
 
 
-def test_a_fit_without_plots_loads_no_matplotlib(loaded):
+def test_fit_without_plots_spares_matplotlib(loaded):
+    """A fit without plots loads no Matplotlib."""
     assert "matplotlib" not in loaded["fit without plots"]
 
 
-def test_ctrl_c_while_figures_are_drawn_leaves_nothing_half_made(cell, calib, monkeypatch, undrawn):
+def test_ctrl_c_leaves_no_half_made_figures(cell, calib, monkeypatch, undrawn):
+    """Ctrl-C while figures are drawn leaves nothing half made."""
     measured = cell.write("m.csv", cell.measure(40))
     arguments = ("fit", "ur5", measured, "--model", "geometry", "--out", "o")
     drawn = []
@@ -61,7 +64,8 @@ def test_ctrl_c_while_figures_are_drawn_leaves_nothing_half_made(cell, calib, mo
     assert calib(*arguments)[0] == 0 and "plot_position.png" in names(cell.folder / "o")
 
 
-def test_an_identification_draws_each_figure_once_and_none_without_plots(tmp_path, calib, monkeypatch, undrawn):
+def test_figures_are_drawn_once_or_never(tmp_path, calib, monkeypatch, undrawn):
+    """An identification draws each figure once, and none without plots."""
     import numpy as np
 
     monkeypatch.chdir(tmp_path)

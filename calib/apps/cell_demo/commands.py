@@ -21,6 +21,7 @@ def demo(
     instrument: str = "cmm",
     guided: bool = False,
     bring: Path | None = None,
+    payload: Annotated[list[str] | None, typer.Option()] = None,
     seed: Seed = 0,
     plots: bool = True,
     verbose: bool = False,
@@ -37,6 +38,7 @@ def demo(
         instrument: cmm, or camera: rendered images of a board
         guided: stop at each step that an engineer performs
         bring: session folder: simulate the files that it waits for
+        payload: label=kg of a payload, with which the motions are played again; as of calib new; repeatable
     """
     from calib.apps.cell_demo import demo as demonstration
     from calib.apps.cell_demo.summary import paths, reasons
@@ -59,6 +61,7 @@ def demo(
             guided=guided,
             plots=plots,
             instrument=instrument,
+            payloads=payload or (),
             verbose=verbose,
         )
     if result.asks:

@@ -1,8 +1,9 @@
-"""The demonstration: a session on a simulated cell, then a comparison with the hidden truth."""
+"""The demonstration: a calibration session on a simulated cell, then a comparison with the hidden true parameters."""
 
 import resource
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,6 +25,7 @@ from calib.toolkit.sessions import (
     MARK,
     ROUND,
     WAITING,
+    Payload,
     Say,
     Session,
     StepState,
@@ -34,6 +36,7 @@ from calib.toolkit.sessions import (
     next_round,
     open_session,
     run_next,
+    stated_payloads,
     step_states,
 )
 from calib.toolkit.simulations import (
@@ -42,6 +45,7 @@ from calib.toolkit.simulations import (
     CameraCell,
     Cell,
     MovingArm,
+    carrying,
     limits_of,
     measure,
     moving_arm,
@@ -74,8 +78,10 @@ SIMULATED = "simulated cell: {note}; nothing was measured on a robot"
 TRAINING = "training"
 # seeds of their noise, how long the arm ran before [s]
 LOGS = ((TRAINING, 2, 240.0), ("validation", 3, 480.0))
-# how long the arm ran before the logs of further rounds [s]
-ROUND_RUNNING = 720.0
+# how long the arm ran before the logs of further rounds, and between logs without and with a payload [s]
+ROUND_RUNNING, PAYLOAD_RUNNING = 720.0, 60.0
+# true payload where mass or centre of mass are not stated: mass [kg], centre of mass in the tip's frame [m]
+PAYLOAD = Payload(2.0, (0.01, 0.02, 0.07))
 
 
 @dataclass(frozen=True)
@@ -84,11 +90,12 @@ class DemoResult:
 
     Attributes:
         session: the session.
-        verdict: verdict of the session; empty where it stopped for an engineer.
+        verdict: verdict of the session; empty where the demonstration stopped for an engineer's work.
         seconds: wall-clock time [s].
-        asks: instructions to the engineer where it stopped; else empty.
-        nominal, calibrated: rms position errors of both arms against the hidden truth [mm]; NaN where it stopped.
-        memory: largest resident set [MB].
+        asks: instructions to the engineer where the demonstration stopped; else empty.
+        nominal, calibrated: rms position errors of the nominal and of the calibrated arm against the hidden truth [mm];
+            NaN where the demonstration stopped.
+        memory: peak memory use of the process (largest resident set) [MB].
     """
 
     session: Session
@@ -111,19 +118,21 @@ def run(
     guided: bool = False,
     plots: bool = True,
     instrument: str = "cmm",
+    payloads: Sequence[str] = (),
     verbose: bool = False,
 ) -> DemoResult:
-    """Return the result of a session on a simulated robot, compared with its hidden truth.
+    """Run a session on a simulated robot, compare the calibrated robot with the hidden truth, and return the result.
 
     Args:
         folder: the session's folder, to be created.
         robot: name of a robot of the library.
         seed: seed of the robot's errors, the noise, the pose selection and the motions.
-        say, progress: print a permanent line, and show a transient status.
-        dynamics: whether to identify dynamics too, where the library knows the robot's masses.
+        say, progress: functions that print a permanent line, and show a transient status.
+        dynamics: whether dynamics are identified too, where the library has the robot's masses.
         guided: stop where an engineer has to act; `simulate_next` then simulates that step.
         plots: whether figures are drawn.
-        instrument: ``cmm``, or ``camera``, which takes rendered images.
+        instrument: ``cmm``, or ``camera``, for which images of a board are rendered.
+        payloads: bodies at the flange, with which the motions are played again, as of ``calib new --payload``.
         verbose: print the session's messages too.
 
     Raises:
@@ -131,6 +140,8 @@ def run(
     """
     if instrument not in ("cmm", "camera"):
         raise UsageError(f"--instrument {instrument}: expected cmm or camera")
+    if payloads and not dynamics:
+        raise UsageError("--payload applies to the dynamics, which --geometry-only excludes")
     started = time.perf_counter()
     cell = virtual_cell(robot, seed)
     if dynamics and cell.nominal.inertias is None:
@@ -140,7 +151,7 @@ def run(
     motion: dict[str, Any] = {}
     if dynamics:
         torques = "both" if sensed(robot) else "motor"
-        motion = MOTION | {"torques": torques}
+        motion = MOTION | {"torques": torques, "payloads": stated_payloads(payloads)}
     begin = partial(
         new_session, folder, robot, instrument, poses=FIT, validation=VALIDATION, seed=seed, dynamics=dynamics, **motion
     )
@@ -179,14 +190,17 @@ def run(
 
 
 def _stopped(session: Session, waiting: StepState) -> tuple[str, ...]:
-    """Return the engineer's instructions, and the command that simulates them."""
+    """Return the engineer's instructions for the step `waiting`, and the commands that simulate it and continue."""
     folder = session.folder
     simulate, go_on = command_line("demo", "--bring", folder), command_line("next", folder)
     return *asks(session, waiting), f"(or simulate this step: {simulate}; then: {go_on})"
 
 
 def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, float]:
-    """Return the rms tool errors [mm] of nominal and calibrated arm against the truth; print and write all errors."""
+    """Return the rms tool errors [mm] of the nominal and of the calibrated arm against the hidden truth.
+
+    All errors are printed, and written to ``truth.txt`` and ``truth.json`` in the session's folder.
+    """
     cell_fit = read_installation(session.fit.path)
     urdf = read_calibrated(session.fit.path).chain
     before, after, bare = true_position_errors(cell, cell_fit, urdf)
@@ -203,7 +217,8 @@ def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, 
         # friction in the middle of the motion that was fitted
         motion = designed_motions(session)[TRAINING]
         running = LOGS[0][2] + REST + motion.period * motion.repeat / 2.0
-        true = true_base(dynamics.model, cell, arm, session.settings.seed, running)
+        payloads = {label: payload.parameters or () for label, payload in _true_payloads(session).items()}
+        true = true_base(dynamics.model, cell, arm, session.settings.seed, running, payloads)
         within, count = share_within(true, read_estimate(session.identification.path))
         truth["torque_percent"] = torques.identified
         truth["within_two_sigma"] = within
@@ -219,10 +234,10 @@ def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, 
 
 
 def simulate_next(folder: Path, say: Say) -> None:
-    """Simulate the files that the session in `folder` waits for; compare a finished session with the truth.
+    """Simulate the files that the session in `folder` waits for; compare a finished session with the hidden truth.
 
     Raises:
-        UsageError: the session waits for no files, or its robot is not one of the library.
+        UsageError: the session waits for no files, or its robot is not in the library.
     """
     session = open_session(folder)
     robot = session.settings.robot.given
@@ -255,7 +270,7 @@ def _step_to_simulate(session: Session) -> str:
 
 
 def _cells_of(session: Session) -> tuple[Cell, CameraCell | None]:
-    """Return the virtual cell of a session, and the same cell with its camera (None for other instruments)."""
+    """Return the session's virtual cell, and this cell with a camera; the second is None for other instruments."""
     cell = virtual_cell(session.settings.robot.given, session.settings.seed)
     if session.settings.instrument.measures != IMAGES:
         return cell, None
@@ -264,7 +279,7 @@ def _cells_of(session: Session) -> tuple[Cell, CameraCell | None]:
 
 
 def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda text: None) -> None:
-    """Simulate the files that a step waits for."""
+    """Simulate the files that the step named `step` waits for."""
     seed = session.settings.seed
     cell, camera_cell = _cells_of(session)
     if step in ("measure", "validate") and camera_cell is not None:
@@ -278,18 +293,22 @@ def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda tex
         say("    (the simulated cell measures both lists of poses)")
     elif step in ("record", "predict"):
         simulate_recordings(session, arm_of(session, cell), seed)
-        say("    (the simulated arm plays both motions)")
+        loads = ", without and with each payload" if session.settings.dynamics.payloads else ""
+        say(f"    (the simulated arm plays both motions{loads})")
     else:
         raise SessionError(f"the demonstration cannot simulate the files that step {step} needs")
 
 
 def arm_of(session: Session, cell: Cell) -> MovingArm:
-    """Return the simulated arm of a session, with its dynamics."""
+    """Return the session's simulated arm with its true dynamics."""
     return moving_arm(cell, session.settings.robot.given, session.settings.seed)
 
 
 def simulate_measurements(session: Session, cell: Cell, seed: int) -> None:
-    """Simulate measurements of the planned poses, with three repeated at the end and drift of the CMM."""
+    """Simulate measurements of the planned poses with a drifting CMM, and write them into the session's folder.
+
+    The first three poses to fit are measured again at the end, so that the drift can be found.
+    """
     _mark(session, cell.note)
     for number, name, q in planned_poses(session.folder, cell.nominal):
         noise = np.random.default_rng([seed, number])
@@ -302,7 +321,7 @@ def simulate_measurements(session: Session, cell: Cell, seed: int) -> None:
 
 
 def _mark(session: Session, note: str) -> None:
-    """Mark a session's files as simulated, for its certificate."""
+    """Mark a session's files as simulated, so that its certificate says so; `note` describes the simulated errors."""
     path = session.path(MARK)
     line = SIMULATED.format(note=note)
     marks = list(read_lines(path))
@@ -311,9 +330,23 @@ def _mark(session: Session, note: str) -> None:
     files.write(path, "\n".join(marks) + "\n")
 
 
+def _true_payloads(session: Session) -> dict[str, Payload]:
+    """Return the session's payloads by label; an unstated mass or centre of mass is that of `PAYLOAD`."""
+    payloads = {}
+    for label, payload in session.settings.dynamics.payloads.items():
+        mass = PAYLOAD.mass if payload.mass is None else payload.mass
+        payloads[label] = Payload(mass, payload.com or PAYLOAD.com)
+    return payloads
+
+
 def simulate_recordings(session: Session, arm: MovingArm, seed: int) -> None:
-    """Simulate recordings of the designed motions."""
-    _mark(session, arm.note)
+    """Simulate torque recordings of the designed motions, without and with each payload.
+
+    They are written into the session's folder.
+    """
+    payloads = _true_payloads(session)
+    payload_notes = [f"; payload '{label}': {payload}" for label, payload in payloads.items()]
+    _mark(session, arm.note + "".join(payload_notes))
     motions = designed_motions(session)
     logs = list(LOGS)
     for name in motions:
@@ -329,3 +362,8 @@ def simulate_recordings(session: Session, arm: MovingArm, seed: int) -> None:
         noise = np.random.default_rng([seed, noise_seed])
         recorded = record(arm, reference, noise, running)
         write_log(recorded, session.path(f"7-recorded/{name}_log.csv"))
+        for number, (label, payload) in enumerate(payloads.items(), 1):
+            loaded = carrying(arm, payload.parameters or ())
+            noise = np.random.default_rng([seed, noise_seed, number])
+            recorded = record(loaded, reference, noise, running + number * PAYLOAD_RUNNING)
+            write_log(recorded, session.path(f"7-recorded/{name}_{label}_log.csv"))

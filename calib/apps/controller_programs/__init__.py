@@ -1,4 +1,4 @@
-"""Robot controllers: programs of poses for them, targets inside them."""
+"""Programs for robot controllers: written from lists of poses, and read for the targets in them."""
 
 OFFERS = {"commands": "commands:app", "formats": ":FORMATS", "write_program": "program:write_program"}
 FORMATS = {

@@ -31,11 +31,11 @@ BEHIND = 120
 
 @dataclass(frozen=True)
 class Setting:
-    """A program's statements on one of its poses.
+    """Tool, user frame and configuration that a program uses for one of its poses.
 
     Attributes:
-        tool, user: names of tool and user frame as in `ProgramFrames`; empty where not stated.
-        configuration: as the program writes it; empty where not stated.
+        tool, user: names of tool and user frame, as keys of `ProgramFrames`; empty where the program names none.
+        configuration: the configuration as the program writes it; empty where the program has none.
     """
 
     tool: str
@@ -45,10 +45,10 @@ class Setting:
 
 @dataclass(frozen=True, eq=False)
 class ProgramFrames:
-    """Settings of a program's poses, in the program's order, and the frames with known numbers.
+    """Tool, user frame and configuration of each pose of a program, and the frames whose numbers are known.
 
     Attributes:
-        settings: one per pose.
+        settings: one for each pose, in the program's order.
         tools, users: name to pose (4, 4) [m] of tools in the controller's flange, and of user frames in its base.
     """
 
@@ -58,15 +58,14 @@ class ProgramFrames:
 
 
 def frames_in(program: Program, further: Mapping[str, str] | None = None) -> ProgramFrames:
-    """Return the settings and frames of a program's poses, read from the program and from further files of its
-    controller.
+    """Return tool, user frame and configuration of each pose in a program, and the frames whose numbers are known.
 
     Args:
         program: the program.
-        further: file name to text; None: no further files.
+        further: file name to text of further files of the controller, which are searched too; None: no such files.
 
     Raises:
-        UsageError: a language whose frames are not read, a tool fixed in the cell, or a frame given twice with
+        UsageError: a language whose frames cannot be read, a tool fixed in the cell, or a frame defined twice with
             different numbers.
     """
     language = LANGUAGES.get(program.controller.language)
@@ -96,14 +95,15 @@ Frames = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Language:
-    """How a language writes frames.
+    """How a programming language of robot controllers writes frames.
 
     Attributes:
-        comment: what begins a comment; empty without comments.
-        setting: (text without comments, target) to the target's setting.
-        numbers: (text without comments, controller) to tools and user frames with numbers.
-        flange, world: names of the all-zero tool and of the controller's base.
-        files: the files that hold the numbers, in words; empty for none.
+        comment: characters that begin a comment; empty for a language without comments.
+        setting: function of (text without comments, target) that returns the target's setting.
+        numbers: function of (text without comments, controller) that returns the tools and the user frames with
+            numbers.
+        flange, world: names of the all-zero tool, and of the controller's base.
+        files: description of the files that contain the numbers; empty for none.
     """
 
     comment: str
@@ -114,30 +114,34 @@ class Language:
     files: str
 
     def base(self) -> Frames:
-        """Return the user frames that coincide with the controller's base: name to identity."""
+        """Return the user frames that coincide with the controller's base: name to identity (4, 4)."""
         return dict.fromkeys(self.world, np.eye(4))
 
     def without_comments(self, text: str) -> str:
-        """Return a text of the same length with blanks in place of comments."""
+        """Return the text with each comment replaced by as many blanks."""
         if not self.comment:
             return text
         return re.sub(f"{self.comment}[^\n]*", lambda match: " " * len(match[0]), text)
 
 
 def _frame(form: str) -> str:
-    """Return the regular expression of a frame from a short form: NUM is a number, a blank any number of blanks."""
+    """Return the regular expression for a short pattern of a frame.
+
+    In the pattern, NUM is a number, and a blank is any number of blanks.
+    """
     return form.replace(" ", r"\s*").replace("NUM", NUMBER)
 
 
 def _posed(match: re.Match[str], first: int, controller: Controller, count: int = 6) -> np.ndarray:
-    """Return the pose (4, 4) [m] from `count` numbers of a match, beginning at group `first`."""
+    """Return the pose (4, 4) [m] from `count` numbers in a regular expression's match, from group `first` on."""
     values = [float(match[group]) for group in range(first, first + count)]
     return pose_of_values(controller, np.array([values]))[0]
 
 
 def _either(pairs: set[tuple[str, str]]) -> tuple[str, str]:
-    """Return the names of tool and user frame of several moves; where moves differ, names joined by 'or', which no
-    frame has.
+    """Return tool and user frame of the moves (tool, user frame) that use one target.
+
+    Where moves differ, their names are joined by 'or'; no frame has such a name.
     """
     tools = {tool for tool, _ in pairs}
     users = {user for _, user in pairs}
@@ -165,8 +169,10 @@ def _tp_setting(text: str, target: Target) -> Setting:
 
 
 def _tp_name(text: str, kind: str, number: str) -> str:
-    """Return a frame's name; for number ``F`` (the active frame) that of the only frame the program selects, else
-    empty.
+    """Return the name of a tool or user frame from its number in a TP program.
+
+    For the number ``F`` (the active frame), it is the only frame that the program selects; empty if it selects none or
+    several.
     """
     if not number.isdigit():
         selected = set(re.findall(rf"{kind}_NUM\s*=\s*(\d+)", text))
@@ -224,7 +230,7 @@ def _krl_setting(text: str, target: Target) -> Setting:
 
 
 def _krl_active(text: str, position: int) -> tuple[str, str]:
-    """Return the names of the tool and the base that are selected before a position in the text."""
+    """Return the names of the tool and the base that are selected before a position in a KRL program's text."""
     active = {"TOOL": "", "BASE": ""}
     for match in _KRL_SELECTED.finditer(text, 0, position):
         if match[3]:
@@ -248,7 +254,7 @@ def _krl_name(kind: str, number: str) -> str:
 
 
 def _binary(literal: str) -> int:
-    """Return the number of ``2`` or of ``B010``."""
+    """Return the integer written as a decimal (``2``) or as a binary literal (``B010``)."""
     if literal[:1].upper() == "B":
         return int(literal[1:], 2)
     return int(literal)
@@ -298,7 +304,7 @@ def _rapid_setting(text: str, target: Target) -> Setting:
 
 
 def _rapid_frames(statement: str) -> tuple[str, str]:
-    """Return the names of tool (the last argument) and work object of a move's arguments."""
+    """Return the names of tool (the last argument) and work object in the arguments of a RAPID move."""
     work = _RAPID_WOBJ.search(statement)
     plain = re.sub(r"\\\w+(?:\s*:=\s*\w+)?", "", statement)
     tool = re.search(r",\s*([A-Za-z_]\w*)\s*$", plain)

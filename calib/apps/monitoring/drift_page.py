@@ -1,4 +1,4 @@
-"""Drift during a measurement with its figures, as `calib drift` shows it."""
+"""Result of `calib drift`: drift of the target during a measurement, with its figures."""
 
 from __future__ import annotations
 
@@ -38,7 +38,9 @@ CAPTION = "Targets of repeated poses minus the arm's prediction."
 
 @dataclass(frozen=True, eq=False)
 class DriftFound(ChartedResult, ReportedResult):
-    """Drift of the target over a measurement. ``print`` shows verdict, trends and repeated poses.
+    """Drift of the target over a measurement.
+
+    ``print`` shows verdict, trends and repeated poses.
 
     Attributes:
         robot: name of the robot.
@@ -55,12 +57,12 @@ class DriftFound(ChartedResult, ReportedResult):
 
     @property
     def verdict(self) -> Verdict:
-        """Whether the drift matters."""
+        """Verdict on whether the drift is acceptable."""
         totals = [f"{trend.what}: {1e3 * trend.total:.2g} mm in all" for trend in self.trends]
         return Verdict.of("; ".join(totals) or "no column of time or temperature", self.noticed)
 
     def section(self) -> Section:
-        """Return a report section with the trends, and the distances between readings of repeated poses."""
+        """Return the report section with the trends, and the distances between readings of repeated poses."""
         columns = [
             RecordColumn("with", "{0.what}", number=False),
             RecordColumn("poses", "{0.poses}"),
@@ -76,7 +78,10 @@ class DriftFound(ChartedResult, ReportedResult):
         return Section("Drift", blocks, self.verdict.level, self.verdict.reason)
 
     def charts(self) -> dict[str, Chart]:
-        """Return the figures by name: the motion of repeated poses' targets, with the slope; empty without trends."""
+        """Return the figures by name: displacement of the target at repeated poses, with the trend.
+
+        The mapping is empty if there are no trends.
+        """
         from calib.toolkit.report_charts import AFTER, QUIET, Chart, Panel, line
 
         panels = []
@@ -92,7 +97,10 @@ class DriftFound(ChartedResult, ReportedResult):
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write a folder with report.html, trends.csv, metrics.json, and the figure as PNG; return the folder."""
+        """Write the result into a folder and return its path.
+
+        The folder contains report.html, trends.csv, metrics.json, and the figure as PNG.
+        """
         rows: list[tuple[object, ...]] = []
         for trend in self.trends:
             for x, displacement in zip(trend.x, trend.moved):
@@ -135,9 +143,9 @@ def drift(
 
     Args:
         robot, base, tip: the arm, as for `calib.load`.
-        measured: CSV files with some poses measured several times, and columns ``time`` or ``temperature``; all
-            from one station of the instrument.
-        settings: displacement above which drift matters, and the instrument's σ.
+        measured: CSV files with some poses measured several times, and columns ``time`` or ``temperature``; all from
+            one station of the instrument.
+        settings: displacement above which the drift is not acceptable, and σ of the instrument.
         options: as for `fit_geometry`.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The dynamics section of reports, for the console output of an identification and for its report."""
+"""The report section on the dynamics, which is also the console output of an identification."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -81,7 +81,7 @@ FED_FORWARD = {
 
 
 class IdentifiedParameter(NamedTuple):
-    """A row of ``estimate.csv``; RSD in percent; σ is None if not measured."""
+    """A row of ``estimate.csv``; the relative standard deviation `rsd` is in percent; σ is None if not estimated."""
 
     name: str
     expression: str
@@ -98,8 +98,8 @@ class DynamicReport:
     Attributes:
         metrics: metrics of the identification.
         estimate: the parameters.
-        effects: effects of the geometry's errors on the parameters; empty if the geometry is taken as exact.
-        unseen: report of the model on unseen motion, with the verdict.
+        effects: effects of geometric errors on the parameters; empty if the geometry is taken as exact.
+        unseen: report on the model's errors on held-out motion, with the verdict.
     """
 
     metrics: ModelMetrics
@@ -109,7 +109,7 @@ class DynamicReport:
 
 
 def read(folder: Path) -> DynamicReport:
-    """Read the results of an identification and of its validation from the folder of the identification.
+    """Read the results of an identification and its validation from the folder of the identification.
 
     Raises:
         UsageError: if files are missing or were written by another version.
@@ -128,7 +128,7 @@ def read(folder: Path) -> DynamicReport:
 
 
 def read_lines(inputs: IdentificationInputs) -> list[str]:
-    """Return text lines on the robot and the recordings, as read."""
+    """Return lines of text that list the robot and the recordings that were read."""
     chain = inputs.chain
     lines = [str(inputs.robot)]
     if isinstance(chain, Chain):
@@ -141,7 +141,7 @@ def read_lines(inputs: IdentificationInputs) -> list[str]:
 
 
 def _recording_line(case: Case, role: str) -> str:
-    """Return the line on a recording: name, duration, rate, kind of motion, payload, and what it is used for."""
+    """Return a line of text on a recording: name, duration, rate, kind of torque, payload, and use."""
     motion = case.motion
     # a recording cut as log.npz@10: ends with a colon
     name = case.name.rstrip(":")
@@ -152,7 +152,7 @@ def _recording_line(case: Case, role: str) -> str:
 
 
 def of_outcome(outcome: IdentificationOutcome, folder: Path | None = None) -> DynamicReport:
-    """Return the report of an identification.
+    """Return the report on an identification.
 
     Args:
         outcome: the identification.
@@ -169,7 +169,7 @@ def of_outcome(outcome: IdentificationOutcome, folder: Path | None = None) -> Dy
 
 
 def outcome_section(outcome: IdentificationOutcome) -> page.Section:
-    """Return the section for the console on an identification: that of its report, without figures and parameters."""
+    """Return the console output on an identification: the report section without figures and parameters."""
     return report_section(of_outcome(outcome), {})
 
 
@@ -180,14 +180,14 @@ def report_section(
     tolerance: float = 0.0,
     delivered: float | None = None,
 ) -> page.Section:
-    """Return the section of a report: errors on unseen motion, torques, excitation, and parameters.
+    """Return the report section on the dynamics: errors on held-out motion, torques, excitation, and parameters.
 
     Args:
-        report: report of the identification.
-        figures: figures by name (`dynamics_figures.captioned`); missing ones are omitted.
-        exported: remarks of the export.
-        tolerance: largest acceptable torque error on unseen motion [%]; 0: no tolerance.
-        delivered: torque error of the exported robot on unseen motion [%]; None if unknown.
+        report: stored results of the identification.
+        figures: figures by name (`dynamics_figures.captioned`); absent figures are left out of the section.
+        exported: remarks on the export.
+        tolerance: largest acceptable torque error on held-out motion [%]; 0: no tolerance.
+        delivered: torque error of the exported robot on held-out motion [%]; None: unknown.
     """
     metrics, unseen = report.metrics, report.unseen
     blocks: list[page.Block] = [_error_table(unseen), _reference_table(unseen), _interval_table(unseen)]
@@ -217,7 +217,7 @@ def report_section(
 
 
 def _parameter_table(estimate: Sequence[IdentifiedParameter]) -> page.ReportTable:
-    """Return the table of identified parameters."""
+    """Return the table of identified parameters with value, σ and relative standard deviation."""
     header = ("parameter", "unit", "value", "σ", "RSD", "contents")
     rows = []
     for parameter in estimate:
@@ -230,7 +230,10 @@ def _parameter_table(estimate: Sequence[IdentifiedParameter]) -> page.ReportTabl
 
 
 def warnings_of(report: DynamicReport) -> list[str]:
-    """Return the warnings of identification and validation, each once, without those that validation refuted."""
+    """Return the warnings of identification and validation without duplicates.
+
+    The warning that there is no held-out motion is omitted if the validation has such motion.
+    """
     refuted: list[str] = []
     if report.unseen.proofs:
         early = [finding for finding in report.metrics.noticed if finding.code == "no-unseen-motion"]
@@ -240,7 +243,11 @@ def warnings_of(report: DynamicReport) -> list[str]:
 
 
 def proof_of(unseen: UnseenReport) -> tuple[str, Score, str]:
-    """Return name, errors and kind of motion of the deciding recording: the worst unseen one, else the fitted one."""
+    """Return name, score and kind of motion of the recording that decides the verdict.
+
+    It is the held-out recording with the largest error; without held-out motion, the training recording with the
+    largest error.
+    """
     scores, motion = unseen.fit, "the training motion"
     if unseen.proofs:
         scores, motion = unseen.proofs, "unseen motion"
@@ -249,7 +256,13 @@ def proof_of(unseen: UnseenReport) -> tuple[str, Score, str]:
 
 
 def _key_figures(unseen: UnseenReport, tolerance: float, delivered: float | None) -> list[page.KeyFigure]:
-    """Return the torque errors that decide the verdict: those of the worst unseen recording."""
+    """Return the torque errors on which the verdict is based: those of the worst held-out recording.
+
+    Args:
+        unseen: report on the model's errors.
+        tolerance: largest acceptable torque error [%]; 0: no tolerance.
+        delivered: torque error of the exported robot [%]; None: unknown.
+    """
     name, proof, _ = proof_of(unseen)
     count = len(unseen.proofs)
     basis = {0: "the training motion", 1: "1 unseen motion"}.get(count, f"worst of {count} unseen motions")
@@ -287,17 +300,17 @@ def _key_figures(unseen: UnseenReport, tolerance: float, delivered: float | None
 
 
 def percent(value: float) -> str:
-    """Return a percentage with three digits as text; a dash if not finite."""
+    """Return a percentage with three significant digits as text; a dash if it is not finite."""
     return _number(value, " %")
 
 
 def _rsd(percent: float) -> str:
-    """Return an RSD [%] as text; "above 1000 %" if larger."""
+    """Return a relative standard deviation [%] as text; "above 1000 %" for larger values."""
     return f"{percent:.0f} %" if percent < 1000.0 else "above 1000 %"
 
 
 def _error_table(unseen: UnseenReport) -> page.ReportTable:
-    """Return the table of torque errors, per row and recording."""
+    """Return the table of torque errors for each recording and torque row."""
     groups = {}
     for name, score in unseen.fit.items():
         groups[f"{name} (fitted)"] = _error_rows(score, unseen)
@@ -308,9 +321,7 @@ def _error_table(unseen: UnseenReport) -> page.ReportTable:
 
 
 def _error_rows(score: Score, unseen: UnseenReport) -> Iterator[Sequence[str]]:
-    """Yield the rows of the error table, with the columns `ERROR_HEADER`: all torques together, then each torque
-    row.
-    """
+    """Yield the rows of the error table for one recording: first all torques together, then each torque row."""
     parts = score.raw, score.filtered, score.moving, score.standing
     totals = [percent(part.total) for part in parts]
     yield "all", "", "", *totals, "", ""
@@ -322,7 +333,7 @@ def _error_rows(score: Score, unseen: UnseenReport) -> Iterator[Sequence[str]]:
 
 
 def rms_words(score: Score, unseen: UnseenReport, row: int) -> tuple[str, str]:
-    """Return the rms error of a torque row in its unit, and in per cent of its limit; "–" where that is not known."""
+    """Return as texts a torque row's rms error in its unit, and in percent of its limit; "–" if unknown."""
     rms = score.raw.rms[row]
     if not np.isfinite(rms):
         return "–", "–"
@@ -337,7 +348,7 @@ def _of_all(row: Sequence[str]) -> bool:
 
 
 def _reference_table(unseen: UnseenReport) -> page.ReportTable:
-    """Return the table of errors of plain references on held-out motion beside the model's; may be empty."""
+    """Return the table of errors on held-out motion by the plain references and by the model; may be empty."""
     header = ("recording", "nominal masses, no friction", "plain least squares", "this model")
     rows = []
     for recording, references in unseen.references.items():
@@ -348,7 +359,7 @@ def _reference_table(unseen: UnseenReport) -> page.ReportTable:
 
 
 def _interval_table(unseen: UnseenReport) -> page.ReportTable:
-    """Return the table of the coverage of predicted 95 % intervals, per row of unseen recordings; may be empty."""
+    """Return the table of the coverage of predicted 95 % intervals on held-out recordings; may be empty."""
     groups = {}
     for name, score in unseen.validation.items():
         coverage = score.interval95
@@ -370,7 +381,7 @@ def _interval_table(unseen: UnseenReport) -> page.ReportTable:
 
 
 def _friction_table(metrics: ModelMetrics) -> page.ReportTable:
-    """Return the table of friction models with their errors on held-out time, for all rows and for each row."""
+    """Return the table of the tried friction models with their errors on held-out time, in total and by torque row."""
     count = max(len(step.joints_percent) for step in metrics.ladder)
     joints = [str(j + 1) for j in range(count)]
     header = ["friction", "p", "total", *joints, "kept at joints"]
@@ -394,7 +405,7 @@ def _rounded(share: float, digits: int) -> str:
 
 
 def _model_sentences(metrics: ModelMetrics) -> list[str]:
-    """Return sentences on the model: number of parameters, method, and eliminated parameters."""
+    """Return sentences on the model: ripple, couplings, method, number of parameters, and eliminated parameters."""
     lines = [_ripple_sentence(ripple) for ripple in metrics.ripple]
     lines += _coupling_sentences(metrics)
     lines.append(f"method {metrics.method}: assumes that {metrics.method_assumes}")
@@ -419,7 +430,7 @@ def _model_sentences(metrics: ModelMetrics) -> list[str]:
 
 
 def _ripple_sentence(ripple: RippleWaves) -> str:
-    """Return the sentence on a joint's torque ripple: its orders, and how much of the residual it explains."""
+    """Return a sentence on a joint's torque ripple: its orders, and the share of the residual that it explains."""
     orders = []
     for wave in ripple.waves:
         gear = "" if wave.gear == ripple.joint else f" of joint {wave.gear}"
@@ -436,7 +447,10 @@ def _condition(number: float) -> str:
 
 
 def _coupling_sentences(metrics: ModelMetrics) -> list[str]:
-    """Return what coupling terms do to the errors of their joints: what they are in the drives nobody measured."""
+    """Return sentences on how much each coupling term between two joints lowers the errors of these joints.
+
+    The physical cause of a coupling is not stated, since nobody measured it in the drives.
+    """
     lines: list[str] = []
     if not metrics.ladder:
         return lines
@@ -458,7 +472,7 @@ def _coupling_sentences(metrics: ModelMetrics) -> list[str]:
 
 
 def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.GeometricEffect]) -> list[page.Block]:
-    """Return the blocks on the effect of geometric errors on the dynamics: summary, and the largest effects."""
+    """Return the summary of how geometric errors affect the dynamic parameters, and a table of the largest effects."""
     geometry = metrics.geometry
     if geometry is None:
         return []
@@ -477,7 +491,7 @@ def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.Ge
 
 
 def _effect_table(effects: Sequence[geometry_tables.GeometricEffect]) -> page.ReportTable:
-    """Return the table of geometric errors with the parameter that each shifts most, and its effect on the torque."""
+    """Return the table of geometric errors, with the parameter that each shifts most, and the effect on the torque."""
     header = (
         "geometric error",
         "sigma",
@@ -496,7 +510,7 @@ def _effect_table(effects: Sequence[geometry_tables.GeometricEffect]) -> page.Re
 
 
 def _loop_sentences(loop: LoopMetrics) -> list[str]:
-    """Return sentences on the closed-loop simulation, and on the bias of least squares."""
+    """Return sentences on the closed-loop simulation, and on the bias of least squares that it reveals."""
     lines = list(loop.notes)
     test = loop.durbin_wu_hausman
     if test is None:
@@ -543,7 +557,12 @@ def _number(value: float, unit: str = "") -> str:
 
 
 def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[page.Block]:
-    """Return the blocks on the simulated tracking errors with the model as feedforward."""
+    """Return tables and texts on simulated tracking errors with the model as feedforward.
+
+    Args:
+        replays: name of a recording -> simulated tracking.
+        failure: reason why no tracking was simulated; empty: none.
+    """
     if failure:
         line = f"tracking with the model as feedforward was not simulated:  {failure}"
         return [page.Text("Tracking, simulated", [line])]
@@ -580,7 +599,7 @@ def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[pa
 
 
 def _identifiability(report: DynamicReport) -> list[str]:
-    """Return sentences on the parameters that the motion identifies, and on the residuals."""
+    """Return sentences on parameters that are not distinguishable from zero, and on whether the residuals are white."""
     lines = []
     weak = [row.name for row in report.estimate if row.rsd is not None and row.rsd > MAX_RSD]
     if weak:

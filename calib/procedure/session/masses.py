@@ -1,13 +1,16 @@
-"""Identified masses in the geometric fit: its compliance is fitted to their gravity torques, not to the description's.
+"""Identified masses in the geometric fit: its compliance is fitted to gravity torques of the identified masses.
+
+Without this iteration, the gravity torques are those of the masses in the robot's description. The iteration is
 
     fit → identify → fit with the identified masses → identify → …
 
-until neither geometry nor dynamics moves by more than `MAX_MOVE` of its σ. A session does so by itself, for fits with
-compliance or sag, up to ``rounds`` of ``[fit]``: ``8-masses`` holds the identification whose masses the fit uses, and
-its change makes the fit, and what follows it, stale; so an interrupted session goes on where it was. By command:
-``calib fit ROBOT MEASURED --masses FOLDER``, ``calib identify``, and again.
+until no parameter of geometry or dynamics changes by more than `MAX_MOVE` of its σ. Sessions do this automatically for
+fits with compliance or sag, up to ``rounds`` times (section ``[fit]``). The folder ``8-masses`` contains the
+identification whose masses the fit uses. If this folder changes, the fit and all later steps are repeated, so that an
+interrupted session can be continued. The commands are ``calib fit ROBOT MEASURED --masses FOLDER`` and ``calib
+identify``, in turn.
 
-The fit takes the masses as exact: the share of the compliance's σ that comes from theirs is left out.
+The fit regards the masses as exact: the σ of the compliance does not include the uncertainty of the masses.
 """
 
 import shutil
@@ -27,7 +30,13 @@ ROUNDS = "rounds.json"
 
 
 def largest_move(before: Path, after: Path) -> float:
-    """Return the largest |Δ| / σ of the parameters of two folders with an estimate; infinite for other parameters."""
+    """Return the largest change of a parameter between two result folders, in units of the parameter's σ.
+
+    Infinite if the folders have other parameters, or if the first folder has no estimate.
+
+    Args:
+        before, after: folders with ``estimate.csv``.
+    """
     if not (before / ESTIMATE).is_file():
         return float("inf")
     old = {row.name: row for row in read_estimate(before)}
@@ -42,9 +51,12 @@ def largest_move(before: Path, after: Path) -> float:
 
 
 def return_masses(session: Session) -> list[str]:
-    """Hand the masses that a session has just identified to its fit, if that would still change; return notes.
+    """Copy the identified masses into the folder from which the fit reads them, if they would still change the fit.
 
-    The fit takes them where it has compliance or sag; its step is then stale.
+    Nothing is done unless the fit has compliance or sag. After copying, the session's fit is repeated.
+
+    Returns:
+        Notes for the user.
     """
     limit = session.settings.fit.rounds
     record_path = session.path(MASSES)

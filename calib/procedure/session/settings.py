@@ -1,9 +1,10 @@
 """Settings of a session, ``session.toml``: robot, instrument, poses, fit and dynamics.
 
-Lengths in m, angles in rad. Every key, what it may be, its default and its comment stand here and nowhere else.
+Lengths are in m, angles in rad. The dataclasses of this module define every key with its allowed values, default and
+comment.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from operator import attrgetter
 from pathlib import Path, PurePath
@@ -13,18 +14,19 @@ from typing import TYPE_CHECKING, Annotated, get_type_hints
 import rtoml
 
 from calib.config import described, parse, read_toml, strict
-from calib.config_types import Checked, Expect, Flag, Holdout, Name, NotNegative, OneOf, Real, Seed, Text, Whole, shown
+from calib.config_types import Checked, Expect, Flag, Holdout, Name, NotNegative, OneOf, Seed, Text, Whole, shown
 from calib.data.poses import Loss, Model
 from calib.data.poses.fit_options import FitOptions, MetresOrZero, RadiansOrZero
 from calib.errors import SessionError
 from calib.identification.friction.friction_ladder import NAMES as FRICTION
 from calib.identification.registry import METHODS
-from calib.identification.settings import IdentificationSettings
+from calib.identification.settings import IdentificationSettings, Payload, mass_as_payload
 from calib.procedure.answers import CertificateSection, Torques
 from calib.procedure.excitation.settings import (
     DEFAULT_DESIGN,
     HARMONICS,
     Evaluations,
+    Front,
     Goal,
     HardGoal,
     Harmonics,
@@ -52,6 +54,8 @@ READABLE_SCHEMAS = (1, SCHEMA)
 NOTHING = "nothing"
 # of a designed motion (our choice): 160 MB per joint and derivative
 MAX_SAMPLES = 20_000_000
+# words in the names of all recordings of a session, besides the numbers of further rounds
+RECORDING_WORDS = ("training", "validation", "log", "round")
 # letters of a file's name
 MAX_NAME = 200
 # where comments begin and end
@@ -65,7 +69,11 @@ _HEAD = (
 
 
 def _beside(value: object) -> object:
-    """Check that a name is a valid relative path, and return it."""
+    """Return a value unchanged after a check that a text is a relative path, which is next to ``session.toml``.
+
+    Raises:
+        ValueError: for an absolute or too long path.
+    """
     if not isinstance(value, str):
         return value
     if PurePath(value).is_absolute() or len(value) > MAX_NAME or "\0" in value:
@@ -99,7 +107,7 @@ class RobotSection:
 @strict
 @dataclass(frozen=True)
 class InstrumentSection:
-    """Section ``[instrument]``: the instrument, and its sigmas.
+    """Section ``[instrument]``: the measuring instrument, and its σ.
 
     Attributes:
         name: what it is called
@@ -196,7 +204,8 @@ class DynamicsSection:
         sigma_percent: largest standard deviation of essential parameters that is wanted [%]; 0: none. Where joints are
             above tolerance_percent, or parameters above this, a further motion is designed (6-excitation/round2);
             with neither stated, the session's end names what is above 10 %
-        payloads: masses [kg] of bodies at the flange by label, as loaded = 3.28
+        payloads: bodies at the flange by label: mass [kg] and, if known, centre of mass in the tip's frame [m], as
+            loaded = 3.28 or loaded = { mass = 3.28, com = [0, 0, 0.05] }; what is not stated is identified
     """
 
     wanted: Flag = True
@@ -207,7 +216,7 @@ class DynamicsSection:
     rate: Rate = DEFAULT_DESIGN.rate
     goals: tuple[Goal, ...] = ()
     hard: tuple[HardGoal, ...] = ()
-    front: Annotated[int, Whole(0, 1000)] = 0
+    front: Front = 0
     repeats: Annotated[int, Whole(1)] = 3
     starts: Starts = DEFAULT_DESIGN.starts
     evaluations: Evaluations = DEFAULT_DESIGN.evaluations
@@ -219,16 +228,22 @@ class DynamicsSection:
     holdout: Holdout = 0.0
     tolerance_percent: NotNegative = 0.0
     sigma_percent: NotNegative = 0.0
-    payloads: Mapping[str, Annotated[float, Real(above=0, words="its mass [kg], a number above 0")]] = field(
-        default_factory=dict
-    )
+    payloads: Mapping[str, Annotated[Payload, Checked(mass_as_payload)]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        _check_labels(self.payloads)
         if self.repeats > MAX_SAMPLES / max(self.period * self.rate, 1e-300):  # a quotient: repeats may be huge
             raise ValueError(
                 f"period {self.period:g} s at rate {self.rate:g} Hz, repeated {self.repeats} times, is more than "
                 f"{MAX_SAMPLES:.0e} samples: lower one of them"
             )
+
+
+def _check_labels(labels: Iterable[str]) -> None:
+    """Raise a ValueError if a label occurs in the names of all recordings, which labels assign to payloads."""
+    for label in labels:
+        if label.lower() in RECORDING_WORDS:
+            raise ValueError(f"payloads: '{label}' is a part of all recordings' names; choose another label")
 
 
 @strict
@@ -257,10 +272,10 @@ class SessionSettings:
 
 
 def read_settings(path: Path) -> SessionSettings:
-    """Read ``session.toml``; missing keys get their defaults, and schema 1 gets no dynamics.
+    """Read ``session.toml``; missing keys get their defaults, and files of schema 1 get no dynamics.
 
     Raises:
-        SessionError: if it was made by a newer version, is damaged, or has an invalid value.
+        SessionError: if the file was made by a newer version, is damaged, or has an invalid value.
     """
     table = read_toml(path, SessionError)
     check_schema(path, table.get("schema"))
@@ -275,10 +290,11 @@ def read_settings(path: Path) -> SessionSettings:
 
 
 def check_schema(path: Path, schema: object) -> None:
-    """Raise an error for a schema number that this version cannot read.
+    """Raise a SessionError, with advice, if this version cannot read the schema of a session's file.
 
-    Raises:
-        SessionError: with advice.
+    Args:
+        path: the file, for the message.
+        schema: the schema number in the file; None: the file has no such number.
     """
     if schema in READABLE_SCHEMAS and type(schema) is int:
         return
@@ -293,14 +309,14 @@ def check_schema(path: Path, schema: object) -> None:
 
 
 def default_keys(section: str) -> dict[str, object]:
-    """Return the defaults of a section by key; empty for a key outside sections."""
+    """Return the default values of a section of ``session.toml`` by key; empty if there is no such section."""
     kind = get_type_hints(SessionSettings).get(section)
     keys = fields(kind) if is_dataclass(kind) else ()
     return {key.name: key.default for key in keys if key.default is not MISSING}
 
 
 def written(settings: SessionSettings) -> str:
-    """Return the text of ``session.toml`` with these settings, including a comment for every key."""
+    """Return the text of ``session.toml`` for the given settings, with a comment for every key."""
     lines = [f"# {line}" for line in _HEAD]
     lines.append(f"schema = {settings.schema}")
     lines += _lines(settings)
@@ -308,27 +324,41 @@ def written(settings: SessionSettings) -> str:
 
 
 def _lines(section: "DataclassInstance | type[DataclassInstance]", prefix: str = "") -> Iterator[str]:
-    """Yield the lines of a section, with the comments of keys aligned in one column, and tables last."""
+    """Yield the lines of a section: first keys with comments aligned in one column, then tables."""
     comments = described(type(section))
     tables = []
     for key in fields(section):
         value, comment = getattr(section, key.name), comments.get(key.name, "")
         if is_dataclass(value) or isinstance(value, Mapping):
             header = f"[{prefix}{key.name}]"
-            if comment:
-                header += f"  # {comment}"
-            tables += ["", header]
+            tables += ["", *_with_comment(header, comment)]
             if is_dataclass(value):
                 tables += _lines(value, f"{key.name}.")
             else:
-                tables += rtoml.dumps(value).splitlines()
+                tables += [_mapping_line(name, entry) for name, entry in value.items()]
         elif key.name != "schema":
-            entry = rtoml.dumps({key.name: value}).rstrip()
-            first, *further = wrap(comment, WIDTH - COLUMN) or [""]
-            yield f"{entry:<{COLUMN - 3}} # {first}" if first else entry
-            for line in further:
-                yield f"{'':{COLUMN - 2}}# {line}"
+            yield from _with_comment(rtoml.dumps({key.name: value}).rstrip(), comment)
     yield from tables
+
+
+def _with_comment(entry: str, comment: str) -> Iterator[str]:
+    """Yield the line of an entry with its comment, which is continued below where it is long."""
+    first, *further = wrap(comment, WIDTH - COLUMN) or [""]
+    yield f"{entry:<{COLUMN - 3}} # {first}" if first else entry
+    for line in further:
+        yield f"{'':{COLUMN - 2}}# {line}"
+
+
+def _mapping_line(name: str, entry: object) -> str:
+    """Return the line of an entry whose name the user chose; a payload with a centre of mass becomes a table."""
+    if isinstance(entry, Payload) and entry.mass is not None and entry.com is None:
+        entry = entry.mass
+    if not is_dataclass(entry):
+        return rtoml.dumps({name: entry}).rstrip()
+    key, _, _ = rtoml.dumps({name: 0}).partition(" =")
+    values = {item.name: getattr(entry, item.name) for item in fields(entry)}
+    keys = {key_name: value for key_name, value in values.items() if value is not None}
+    return f"{key} = {{ {', '.join(rtoml.dumps(keys).splitlines())} }}"
 
 
 def example() -> str:

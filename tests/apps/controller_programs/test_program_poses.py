@@ -58,7 +58,8 @@ def run(capsys, *words: object) -> tuple[int, str, str]:
     return code, out, err
 
 
-def test_poses_are_those_moved_to_the_arms_base_by_hand(fitted, tmp_path, capsys):
+def test_poses_equal_those_moved_by_hand(fitted, tmp_path, capsys):
+    """Poses are those moved to the arm's base by hand."""
     folder, chain = fitted
     (tmp_path / "p.ls").write_text(program(chain))
     (tmp_path / "frames.txt").write_text(f"{line('UTOOL[2]', TOOL)}\n{line('UFRAME[1]', USER)}\n")
@@ -84,7 +85,8 @@ def test_poses_are_those_moved_to_the_arms_base_by_hand(fitted, tmp_path, capsys
     assert np.abs(expected - read_program(tmp_path / "p.ls").poses()).max() > 1e-4, "there was something to compensate"
 
 
-def test_what_the_program_does_not_say_is_named_or_stated(fitted, tmp_path, capsys):
+def test_gaps_of_program_named_or_stated(fitted, tmp_path, capsys):
+    """What the program does not say is named, or stated."""
     folder, chain = fitted
     path, sent = tmp_path / "p.ls", tmp_path / "sent.ls"
     path.write_text(program(chain))
@@ -103,7 +105,8 @@ def test_what_the_program_does_not_say_is_named_or_stated(fitted, tmp_path, caps
     assert code == 2 and "the active tool" in err and "the active user frame" in err
 
 
-def test_a_configuration_that_is_not_the_poses_is_said_with_its_line(fitted, tmp_path, capsys):
+def test_foreign_configuration_is_said(fitted, tmp_path, capsys):
+    """A configuration that is not the pose's is said with its line."""
     folder, chain = fitted
     path = tmp_path / "p.ls"
     path.write_text(program(chain, configuration="N U B, 0, 0, 0"))

@@ -31,7 +31,7 @@ def arms(count: int, seed: int, uncertainty: float = 0.3) -> tuple[np.ndarray, l
     return true, [CalibratedChain(NOMINAL.with_values(one), NOMINAL, covariance) for one in found]
 
 
-def test_mean_and_deviation_of_many_arms_are_recovered() -> None:
+def test_mean_and_deviation_are_recovered() -> None:
     """Without what the fits themselves are uncertain by; the nominal, far off, counts as one of 101."""
     found = prior.spread(arms(100, 1, uncertainty=1.0)[1])
     assert [one.name for one in found] == list(NOMINAL.names) and {one.arms for one in found} == {100}
@@ -41,7 +41,7 @@ def test_mean_and_deviation_of_many_arms_are_recovered() -> None:
 
 
 @pytest.mark.parametrize("count", [2, 4, 8])
-def test_the_next_arm_is_where_it_is_expected(count: int) -> None:
+def test_next_arm_is_where_expected(count: int) -> None:
     """χ² per parameter over 20 fleets: near 1, whatever the number of arms."""
     total = []
     for seed in range(20):
@@ -52,7 +52,8 @@ def test_the_next_arm_is_where_it_is_expected(count: int) -> None:
     assert 0.7 < np.mean(total) < 1.4, np.mean(total)
 
 
-def test_a_parameter_that_few_arms_fitted_takes_its_familys_deviation() -> None:
+def test_rare_parameter_has_family_deviation() -> None:
+    """A parameter that few arms fitted takes its family's deviation."""
     _, robots = arms(6, 3)
     assert robots[0].covariance is not None
     fewer = robots[0].covariance.copy()
@@ -99,7 +100,7 @@ def test_a_bent_and_a_loose_tool_are_named() -> None:
     assert not [one for one in tools({name: row for name, row in used.items() if row[0] == "T2"}) if one.findings()]
 
 
-def test_few_arms_that_happen_to_agree_accuse_no_tool() -> None:
+def test_few_agreeing_arms_accuse_no_tool() -> None:
     """Of three arms with each of two equal tools, 2.6 σ are exceeded as seldom as said, in distance and in error.
 
     The tool's position scatters along one axis, as it does where that is also the last link's.
@@ -115,7 +116,7 @@ def test_few_arms_that_happen_to_agree_accuse_no_tool() -> None:
     assert (beyond < 0.02).all(), beyond
 
 
-def test_three_arms_show_a_tool_that_is_far_off() -> None:
+def test_three_arms_show_a_tool_far_off() -> None:
     """Heights [mm] of six simulated arms' tools, one 4 mm longer; with the names exchanged, none is accused."""
     heights = {"A": (99.426, 100.962, 100.204), "B": (104.099, 104.56, 103.478)}
     used = {f"{tool}{z}": (tool, np.array([0.05, 0.02, 1e-3 * z]), 5e-5) for tool, own in heights.items() for z in own}

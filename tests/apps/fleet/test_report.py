@@ -63,7 +63,7 @@ def test_an_arm_that_drifted_is_named(fits: Path, monkeypatch) -> None:
     assert current.values["current"] == str(fits / "two") and current.values["how"] == "the order given"
 
 
-def test_a_failed_fit_is_no_part_of_the_distribution(fits: Path, tmp_path: Path) -> None:
+def test_failed_fit_is_not_in_distribution(fits: Path, tmp_path: Path) -> None:
     """It is named with its reason, and the verdict is marginal; fail where no other is left. A marginal one stays."""
     for name in ("one", "two", "three", "odd"):
         shutil.copytree(fits / name, tmp_path / name)

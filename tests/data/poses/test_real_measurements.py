@@ -38,7 +38,8 @@ def test_ur10_poses(data):
     assert load(data, "ur10_ipa/A_grid_2500.csv", "model.urdf").q.shape == (2500, 6)
 
 
-def test_motoman_joints_by_name_and_uncertainties_by_options(data):
+def test_motoman_by_names_and_options(data):
+    """The Motoman's joints come by name, and its uncertainties by options."""
     joints = ["E_external", "S", "L", "U", "R", "B", "T"]
     options = FileOptions(columns={f"sigma_{axis}": f"unc_{axis}" for axis in "xyz"}, sigma=Sigma(floor=1e-6))
     block = load(data, "motoman_leica/right_wide_386.csv", "model_right.urdf", options=options)

@@ -75,7 +75,7 @@ def error(estimate) -> float:
 
 
 @pytest.mark.slow
-def test_instruments_are_right_where_least_squares_is_biased():
+def test_instruments_are_right_unlike_ols():
     """Over seeds: least squares is hundreds of spreads off, IV a few.
 
     Those few are no noise: a torque held for a control period leads the positions by half of it, which IV cannot know.
@@ -94,7 +94,7 @@ def test_instruments_are_right_where_least_squares_is_biased():
     assert all(result.verdict.biased() and result.valid for result in results)
 
 
-def test_a_sign_drowned_in_noise_is_taken_from_the_simulation(monkeypatch):
+def test_drowned_sign_comes_from_simulation(monkeypatch):
     """A velocity noise of many widths of the Coulomb sign shrinks its column of W: IV makes up by too much Fc.
 
     Measured: Fc 26 and 38 % too large with the measured sign, 0.2 and 6 % with the simulated one.
@@ -113,7 +113,7 @@ def test_a_sign_drowned_in_noise_is_taken_from_the_simulation(monkeypatch):
 
 
 @pytest.mark.slow
-def test_where_the_simulation_does_not_follow_the_motion_drowned_signs_are_those_of_the_measured_speed(monkeypatch):
+def test_drowned_sign_where_simulation_lags(monkeypatch):
     """With a fifth of the bandwidth the simulated reversals come late; with the right controller nothing changes.
 
     Measured: 3 % off in place of 24, and 2.9 % with the right one.
@@ -130,7 +130,7 @@ def test_where_the_simulation_does_not_follow_the_motion_drowned_signs_are_those
 
 
 @pytest.mark.parametrize(("runs", "accused"), [(3, 0), pytest.param(12, 1, marks=pytest.mark.slow)])
-def test_without_noise_in_the_positions_least_squares_is_cleared(runs, accused):
+def test_exact_positions_clear_least_squares(runs, accused):
     """At 1 %: of 12 honest runs at most one is accused."""
     results = [found(log(0.0, seed)) for seed in range(runs)]
     assert sum(result.verdict.biased() for result in results) <= accused
@@ -139,7 +139,8 @@ def test_without_noise_in_the_positions_least_squares_is_cleared(runs, accused):
         assert error(result.fit.estimate) < 1e-2
 
 
-def test_didim_and_constraints_come_to_the_same():
+def test_didim_agrees_with_constraints():
+    """DIDIM and constraints come to the same."""
     case = log(1e-3, 3)
     plain, positive = found(case), found(case, positive=("ZZ1R", "Fv1", "Fc2"))
     didim = found(case, method="didim", limit=20)
@@ -148,7 +149,8 @@ def test_didim_and_constraints_come_to_the_same():
     assert error(plain.ordinary.estimate) > 2.0 * error(plain.fit.estimate)
 
 
-def test_a_bound_that_binds_leaves_no_spread_of_its_parameter_and_less_of_the_others():
+def test_binding_bound_removes_spread():
+    """A bound that binds leaves no spread of its parameter, and less of the others."""
     case = log(1e-3, 3, np.inf)
     plain = found(case, v0=np.inf)
     names = list(plain.names)
@@ -163,7 +165,8 @@ def test_a_bound_that_binds_leaves_no_spread_of_its_parameter_and_less_of_the_ot
 
 
 @pytest.mark.parametrize("method", ["iv", "didim"])
-def test_a_curved_constraint_holds_in_every_round(method):
+def test_curved_constraint_holds_in_rounds(method):
+    """A curved constraint holds in every round."""
     case = log(1e-3, 3)
     _, model, base = arm()
     curved = (CurvedConstraint("Fv1 * Fv2 >= 0.7"), CurvedConstraint("ZZ1R * Fc1 <= 100"))
@@ -176,19 +179,21 @@ def test_a_curved_constraint_holds_in_every_round(method):
 
 
 @pytest.mark.parametrize("wrong", [PD.slower(3.0), controllers.pd(1.4 * PD.kp, 0.7 * PD.kd)])
-def test_a_wrong_controller_down_to_a_third_of_the_bandwidth_still_serves(wrong):
+def test_wrong_controller_still_serves(wrong):
+    """A wrong controller, down to a third of the bandwidth, still serves."""
     result = found(log(1e-3, 4), Loop(wrong, motion(), EVERY))
     assert error(result.fit.estimate) < 0.05 < error(result.ordinary.estimate)
 
 
-def test_the_loop_ends_in_few_rounds_wherever_it_starts():
+def test_loop_ends_soon_wherever_it_starts():
+    """The loop ends in few rounds, wherever it starts."""
     case = log(1e-3, 2)
     near, far = found(case, inertia=np.array([1.5, 0.3])), found(case, inertia=np.array([0.3, 3.0]))
     assert max(len(near.rounds), len(far.rounds)) <= 5
     assert np.allclose(near.fit.estimate.values, far.fit.estimate.values, atol=5e-3)
 
 
-def test_gains_stated_for_another_inertia_follow_the_estimate():
+def test_gains_of_other_inertia_follow():
     """Half the gains, stated for half the inertia, are the robot's own once the estimate is."""
 
     case, plant = log(1e-3, 6), arm()[0]
@@ -238,7 +243,8 @@ def test_what_cannot_be_done_is_said():
     assert instrumental_variables.settled(found(case).fit, found(case).fit)
 
 
-def test_instruments_that_do_not_excite_a_parameter_are_named():
+def test_unexcited_parameters_are_named():
+    """Instruments that do not excite a parameter are named."""
     still = controllers.Reference(motion().t, motion().q * [1.0, 0.0], motion().v * [1.0, 0.0], motion().a * [1.0, 0.0])
     run = simulate(arm()[0], PD, still, Sensing(1e-5, every=EVERY))
     recording = Recording(run.t, run.measured, run.tau, "torque", ("joint1", "joint2"))
@@ -250,7 +256,7 @@ def test_instruments_that_do_not_excite_a_parameter_are_named():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("step", "value"), [("asymmetric", 0.4), ("stribeck", 0.6), ("cubic", 0.01), ("load", 0.05)])
-def test_instruments_know_all_friction_that_the_simulator_knows(step, value):
+def test_instruments_know_all_friction(step, value):
     """Measured: within 0.7 of a sigma for every parameter, where least squares is 15 of its sigmas off."""
     plant, model, base = arm()
     terms = [one for j in range(2) for one in drives.offered(step, j, RecordedRange(0.5, 4.0, 4.0, 3.6))]

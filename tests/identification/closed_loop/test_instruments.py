@@ -37,7 +37,8 @@ def planted(
     return instruments, matrix, clean @ TRUTH + error + (matrix - clean) @ TRUTH
 
 
-def test_it_is_the_textbook_formula_with_its_covariance_and_two_stage_least_squares():
+def test_formula_is_two_stage_least_squares():
+    """The estimate is the textbook formula with its covariance, and two-stage least squares."""
     z, w, y = planted(0, 1.0)
     found = iv(instrument(z, w, y)).estimate
     assert found.values == pytest.approx(np.linalg.solve(z.T @ w, z.T @ y), rel=1e-9)
@@ -57,7 +58,8 @@ def test_rows_are_weighted_on_both_sides():
     assert found == pytest.approx(np.linalg.solve((z.T * omega) @ w, (z.T * omega) @ y), rel=1e-9)
 
 
-def test_blocks_equal_the_whole_and_least_squares_is_in_the_same_triangles():
+def test_blocks_equal_the_whole():
+    """Blocks equal the whole, and least squares is in the same triangles."""
     z, w, y = planted(2, 1.0)
     whole = instrument(z, w, y, names=["a", "b", "c"])
     half = instrument(z[:150], w[:150], y[:150], names=["a", "b", "c"])
@@ -67,14 +69,16 @@ def test_blocks_equal_the_whole_and_least_squares_is_in_the_same_triangles():
     assert ols(both.least_squares()).estimate.values == pytest.approx(np.linalg.lstsq(w, y)[0], rel=1e-10)
 
 
-def test_instruments_equal_to_the_columns_give_least_squares():
+def test_columns_as_instruments_give_ols():
+    """Instruments equal to the columns give least squares."""
     _, w, y = planted(3)
     found, ordinary = iv(instrument(w, w, y)).estimate, ols(instrument(w, w, y).least_squares()).estimate
     assert found.values == pytest.approx(ordinary.values, rel=1e-10)
     assert found.covariance == pytest.approx(ordinary.covariance, rel=1e-9)
 
 
-def test_it_is_unbiased_where_least_squares_is_not_and_its_covariance_is_true():
+def test_instruments_are_unbiased_unlike_ols():
+    """Instruments are unbiased where least squares is not, and their covariance is true."""
     errors, sizes, naive = [], [], []
     for seed in range(300):
         problem = instrument(*planted(seed, 1.0))
@@ -88,7 +92,8 @@ def test_it_is_unbiased_where_least_squares_is_not_and_its_covariance_is_true():
     assert np.mean(sizes) == pytest.approx(3.0, abs=4 * np.sqrt(6 / 300) + 0.1)
 
 
-def test_noise_in_the_columns_themselves_is_cured_too():
+def test_noise_in_columns_is_cured_too():
+    """Noise in the columns themselves is cured, too."""
     naive, cured = [], []
     for seed in range(60):
         rng = np.random.default_rng(seed)
@@ -101,7 +106,8 @@ def test_noise_in_the_columns_themselves_is_cured_too():
     assert np.abs(np.mean(cured, axis=0)).max() < 4 * np.std(cured) / np.sqrt(60)
 
 
-def test_durbin_wu_hausman_keeps_its_level_where_least_squares_is_right():
+def test_durbin_wu_hausman_keeps_its_level():
+    """The Durbin-Wu-Hausman test keeps its level where least squares is right."""
     verdicts = [exogeneity(instrument(*planted(seed, miss=0.3))) for seed in range(400)]
     assert np.mean([v.p < 0.05 for v in verdicts]) == pytest.approx(0.05, abs=0.035)
     assert verdicts[0].degrees[0] == 3
@@ -111,7 +117,8 @@ def test_durbin_wu_hausman_sees_the_feedback():
     assert np.mean([exogeneity(instrument(*planted(seed, 1.0))).biased() for seed in range(100)]) > 0.95
 
 
-def test_the_augmented_regression_is_the_f_test_written_out():
+def test_augmented_regression_is_f_test():
+    """The augmented regression is the F test written out."""
     z, w, y = planted(4, 0.3)
     v = w - z @ np.linalg.lstsq(z, w)[0]
     sums = [np.sum((y - m @ np.linalg.lstsq(m, y)[0]) ** 2) for m in (w, np.hstack([w, v]))]
@@ -120,14 +127,17 @@ def test_the_augmented_regression_is_the_f_test_written_out():
     assert verdict.degrees == (3, 394)
 
 
-def test_columns_that_the_instruments_explain_wholly_are_not_tested():
+def test_explained_columns_go_untested():
+    """Columns that the instruments explain wholly are not tested."""
     z, w, y = planted(6, 1.0)
     w[:, 2] = z[:, 2]
     y = y + 0.0
     assert exogeneity(instrument(z, w, y)).degrees[0] == 2
 
 
-def test_autocorrelated_noise_needs_the_inflation_to_keep_the_level():
+def test_autocorrelation_needs_inflation():
+    """Autocorrelated noise needs the inflation to keep the level."""
+
     def rejected(tau):
         result = []
         for seed in range(150):
@@ -142,7 +152,8 @@ def test_autocorrelated_noise_needs_the_inflation_to_keep_the_level():
     assert rejected((1 + 0.81) / (1 - 0.81)) < 0.12  # columns and noise with the same correlation: Σ ρ_k²
 
 
-def test_the_outer_loop_rests_when_parameters_and_residual_do_and_only_then():
+def test_loop_rests_with_values_and_residual():
+    """The outer loop rests when parameters and residual do, and only then."""
     z, w, y = planted(12)
     fit = iv(instrument(z, w, y))
     assert settled(fit, iv(instrument(z, w, y * 1.001)))
@@ -152,7 +163,8 @@ def test_the_outer_loop_rests_when_parameters_and_residual_do_and_only_then():
     assert not settled(fit, iv(instrument(z, w, noisy)))  # the same parameters, another residual
 
 
-def test_strength_of_perfect_good_and_useless_instruments():
+def test_strength_of_instruments():
+    """Strength of perfect, good and useless instruments."""
     z, w, y = planted(7, 1.0)
     same, good = strength(instrument(w, w, y)), strength(instrument(z, w, y))
     useless = strength(instrument(np.column_stack([z[:, :2], np.random.default_rng(7).normal(size=400)]), w, y))
@@ -163,7 +175,8 @@ def test_strength_of_perfect_good_and_useless_instruments():
     assert useless.partial_r2[2] < 0.05 < 0.25 < useless.partial_r2[:2].min()
 
 
-def test_first_stage_values_are_those_of_the_regressions_written_out():
+def test_first_stage_equals_regressions():
+    """First-stage values are those of the regressions written out."""
     z, w, y = planted(8, 1.0, miss=0.5)
     found = strength(instrument(z, w, y))
     fitted = z @ np.linalg.lstsq(z, w)[0]
@@ -175,7 +188,8 @@ def test_first_stage_values_are_those_of_the_regressions_written_out():
     assert found.condition == pytest.approx(np.linalg.cond(zu.T @ wu), rel=1e-8)
 
 
-def test_an_instrument_without_motion_and_dependent_columns_are_named():
+def test_motionless_instrument_is_named():
+    """An instrument without motion and dependent columns are named."""
     z, w, y = planted(9)
     still = z.copy()
     still[:, 1] = 0.0
@@ -196,7 +210,7 @@ def bounded(z: np.ndarray, w: np.ndarray, y: np.ndarray, bound: float) -> np.nda
     return np.array([found, by_free_instruments(problem, np.ones(1), found, normals)])
 
 
-def test_both_forms_of_constrained_instruments_are_their_formulas():
+def test_constrained_forms_match_formulas():
     """The slides' relation of free and constrained estimate is that of the free columns' instruments alone."""
     z, w, y = planted(10, 1.0)
     free = iv(instrument(z, w, y)).estimate.values
@@ -207,7 +221,7 @@ def test_both_forms_of_constrained_instruments_are_their_formulas():
         assert found == pytest.approx(np.append(free[:2] + moved, 0.4), rel=1e-9)
 
 
-def test_the_forms_part_where_a_bound_is_wrong():
+def test_forms_part_where_a_bound_is_wrong():
     """Weak instruments: 0.24 σ apart at the true bound, 2.4 σ with one 6 σ off, where the slides' form errs less."""
     apart, errors = [], []
     for seed in range(100):

@@ -29,7 +29,7 @@ def times(factor: float) -> dict:
     return {"kp": tuple(factor * np.array(LOOP.kp)), "kd": tuple(factor * np.array(LOOP.kd))}
 
 
-def test_gains_that_are_off_are_named_with_their_factor():
+def test_wrong_gains_are_named_with_factor():
     """Of cloe every parameter is off by it; what instruments say of least squares there is not said."""
     found, test = judged("cloe", 1e-5, 0.05, **times(2.0))
     assert found is not None and found.beside == "iv" and found.sigmas > 100.0
@@ -41,7 +41,7 @@ def test_gains_that_are_off_are_named_with_their_factor():
     assert read_record(LoopDisagreement, asdict(found)) == found
 
 
-def test_a_velocity_formed_otherwise_is_named():
+def test_velocity_formed_otherwise_is_named():
     """Half a period of it is inertia: the residuals of positions hold nothing of it."""
     found, test = judged("cloe", 1e-5, 0.02, reference_velocity="difference")
     assert found is not None and test.found is not None and not len(test.found.off)
@@ -50,7 +50,8 @@ def test_a_velocity_formed_otherwise_is_named():
     np.testing.assert_allclose(found.factor, 1.0, atol=0.1)
 
 
-def test_noise_wider_than_the_smoothed_sign_is_noted():
+def test_noise_beyond_smoothed_sign_is_noted():
+    """Noise wider than the smoothed sign is noted."""
     one = problem(0, 1e-3, v0=0.005)
     test = compare_with_loop(one, METHODS["iv"].estimate(one))
     assert "noisy-signs" in [one.code for one in test.findings(is_estimate=True)]
@@ -59,7 +60,8 @@ def test_noise_wider_than_the_smoothed_sign_is_noted():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["cloe", "clie"])
 @pytest.mark.parametrize("noise", [(0.0, 0.05), (2e-5, 0.02), (5e-4, 0.1), (2e-3, 0.05)])
-def test_of_a_loop_that_is_right_nothing_is_said(name: str, noise: tuple[float, float]):
+def test_right_loop_is_not_remarked_upon(name: str, noise: tuple[float, float]):
+    """Nothing is said of a loop that is right."""
     for seed in range(3):
         found, test = judged(name, *noise, seed=seed)
         assert found is None
@@ -68,14 +70,15 @@ def test_of_a_loop_that_is_right_nothing_is_said(name: str, noise: tuple[float, 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["iv", "didim"])
-def test_estimates_that_bear_another_loop_come_with_a_note(name: str):
+def test_robust_estimates_get_a_note(name: str):
+    """Estimates that bear another loop come with a note."""
     found, test = judged(name, 1e-5, 0.05, **times(0.5))
     assert found is None and "loop-gains-off" in [one.code for one in test.findings(is_estimate=True)]
     assert test.found is not None
     np.testing.assert_allclose(test.found.stray, 0.5, rtol=0.05)
 
 
-def test_a_loop_that_explains_less_torque_than_the_model_is_named():
+def test_loop_explaining_too_little_is_named():
     """0.8 of the reference's velocity, whose gains no tracking error tells: 4 for 2 %, and 6 for 0.8."""
     _, test = judged("iv", 1e-5, 0.05, share=0.8, timing="stated")
     (said,) = test.findings(is_estimate=True)
@@ -83,7 +86,7 @@ def test_a_loop_that_explains_less_torque_than_the_model_is_named():
     assert [row[-10:] for row in said.values["rows"]] == ["at joint 1", "at joint 2"]
 
 
-def test_weak_instruments_are_named_beside_an_estimate_and_in_its_failure():
+def test_weak_instruments_are_named():
     """Positions of 1.5 mrad noise: Cragg-Donald 8.8; of 2 mrad the estimate does not settle."""
     _, test = judged("iv", 1.5e-3, 0.05)
     (said,) = test.findings(is_estimate=True)
@@ -93,7 +96,8 @@ def test_weak_instruments_are_named_beside_an_estimate_and_in_its_failure():
     assert weak is not None and float(weak[1]) < 10.0
 
 
-def test_a_wrong_derivative_of_a_curved_constraint_is_refused_in_a_simulated_loop_too():
+def test_wrong_derivative_is_refused_in_loop():
+    """A wrong derivative of a curved constraint is refused in a simulated loop, too."""
     curved = CurvedConstraint(lambda Fv1, Fv2: 1.0 - Fv1 * Fv2, lambda Fv1, Fv2: (-Fv2, Fv1), "product")
     with pytest.raises(UsageError, match=r"'product': its derivative by Fv2 is stated as .* differences of h give -"):
         METHODS["pc-iv"].estimate(replace(problem(0, 1e-3, 0.05), constraints=ConstraintSettings(curved=(curved,))))

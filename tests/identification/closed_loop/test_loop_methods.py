@@ -86,7 +86,7 @@ def friction_error(out: Path) -> float:
 
 
 @pytest.mark.slow
-def test_iv_is_right_where_noisy_positions_bias_least_squares(robot, tmp_path, capsys):
+def test_iv_is_right_where_noise_biases_ols(robot, tmp_path, capsys):
     """Both through the command, on another motion whose log is clean; a prior would hide a part of the bias."""
     train, other = log(tmp_path, "train.csv", 1, noise=3e-3), log(tmp_path, "other.csv", 2)
     plain = "prior = 'none'\n" + PLAIN
@@ -129,7 +129,8 @@ def test_didim_is_a_method_of_its_own(robot, tmp_path):
 
 
 @pytest.mark.parametrize("method", ["pc-iv", pytest.param("pc-didim", marks=pytest.mark.slow)])
-def test_constraints_hold_in_every_round_and_the_folder_stays_readable(robot, tmp_path, capsys, method):
+def test_constraints_hold_in_every_round(robot, tmp_path, capsys, method):
+    """Constraints hold in every round, and the folder stays readable."""
     train = log(tmp_path, "train.csv", 1, noise=1e-3)
     limit = 1.5 * planted.DRIVES["Fv"][0]
     code, out = identify(robot, tmp_path, train, f"{GAINS}[constraints]\nbounds = {{ Fv1 = [{limit}, inf] }}", method)
@@ -143,7 +144,7 @@ def test_constraints_hold_in_every_round_and_the_folder_stays_readable(robot, tm
 
 
 @pytest.mark.slow
-def test_an_estimate_pulled_to_where_no_controller_holds_it_ends_and_says_so(robot, tmp_path, capsys):
+def test_uncontrollable_estimate_ends(robot, tmp_path, capsys):
     """M(q) barely definite is nothing that a sampled controller can hold: it is kept away from singular, and told."""
     train = log(tmp_path, "train.csv", 1, noise=1e-3)
     _, out = identify(robot, tmp_path, train, f"{GAINS}[constraints]\nbounds = {{ ZZ2R = [-inf, -0.1] }}", "pc-iv")
@@ -153,7 +154,7 @@ def test_an_estimate_pulled_to_where_no_controller_holds_it_ends_and_says_so(rob
 
 
 @pytest.mark.slow
-def test_without_noise_in_the_positions_least_squares_stands(robot, tmp_path):
+def test_exact_positions_confirm_ols(robot, tmp_path):
     """What the test still sees is small: no parameter is off by three sigma."""
     code, out = identify(robot, tmp_path, log(tmp_path, "train.csv", 1), GAINS, "wls")
     found = json.loads((out / "metrics.json").read_text())
@@ -161,7 +162,8 @@ def test_without_noise_in_the_positions_least_squares_stands(robot, tmp_path):
     assert not any("method 'iv'" in line for line in found["warnings"])
 
 
-def test_the_controller_may_be_read_from_the_log(robot, tmp_path, capsys):
+def test_controller_may_come_from_the_log(robot, tmp_path, capsys):
+    """The controller may be read from the log."""
     train = log(tmp_path, "train.csv", 1, noise=1e-5, form="q_des_{}")
     code, out = identify(robot, tmp_path, train, 'controller = "identify"\nband = 8\nrate = 1000\n')
     read = json.loads((out / "metrics.json").read_text())["loop"]
@@ -172,7 +174,8 @@ def test_the_controller_may_be_read_from_the_log(robot, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("kind", ["csv", pytest.param("npz", marks=pytest.mark.slow)])
-def test_the_reference_may_be_a_file_of_its_own(robot, tmp_path, kind):
+def test_reference_may_be_a_separate_file(robot, tmp_path, kind):
+    """The reference may be a file of its own."""
     train = log(tmp_path, "train.csv", 1, noise=1e-3, form="")
     asked = motion(1)
     if kind == "csv":
@@ -223,7 +226,8 @@ def test_what_cannot_be_simulated_is_refused(robot, tmp_path, capsys, log_as, lo
     assert code == 2 and message in " ".join(capsys.readouterr().err.split()) and not out.exists()
 
 
-def test_gains_of_another_length_are_refused_whatever_the_method(robot, tmp_path, capsys):
+def test_wrong_number_of_gains_is_refused(robot, tmp_path, capsys):
+    """Gains of another length are refused, whatever the method."""
     code, _ = identify(
         robot, tmp_path, log(tmp_path, "train.csv", 1), 'controller = "pd"\nkp = [1, 2]\nkd = [1]\n', "ols"
     )
@@ -231,7 +235,8 @@ def test_gains_of_another_length_are_refused_whatever_the_method(robot, tmp_path
     assert "[loop] kp: 2 values for 3 joints" in " ".join(capsys.readouterr().err.split())
 
 
-def test_every_key_of_the_loop_is_documented_and_read():
+def test_loop_keys_are_documented_and_read():
+    """Every key of the loop is documented and read."""
     for key in (field.name for field in fields(loop_settings.LoopSettings)):
         assert re.search(rf"^    {key} = ", loop_settings.__doc__, re.M), key
     found = identify_options.parse_options(
@@ -262,7 +267,7 @@ def noisy_case() -> Case:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["iv", "didim"])
-def test_it_is_the_two_sided_difference_of_refits_and_least_squares_is_not(method):
+def test_sensitivity_is_difference_of_refits(method):
     """Measured: off by 0.3 % (iv, didim) and 57 % (least squares) of the change, in sigmas of the estimate."""
     arm, case = planted.arm(), noisy_case()
     loop = loop_settings.LoopSettings(controller="pd", kp=tuple(KP), kd=tuple(KD), rate=RATE)
@@ -298,7 +303,7 @@ def design(folder) -> Periodic:
 
 
 @pytest.mark.slow
-def test_a_designed_motion_is_the_reference_of_its_log(robot, tmp_path):
+def test_designed_motion_is_reference_of_log(robot, tmp_path):
     """Measured: its beginning within 0.02 ms; iv, didim as with a column q_ref (10 ms late: didim 6 sigmas)."""
     motion, lead, end = design(tmp_path / "motion"), 0.7337, 0.7337 + 2 * 8.0
     t = np.arange(0.0, end + 0.6, 1.0 / RATE)

@@ -23,7 +23,8 @@ def comparison(problem: IdentificationProblem, method: str) -> _Comparison:
 
 
 @pytest.mark.parametrize(("method", "rows"), [pytest.param("cloe", LINK, marks=pytest.mark.slow), ("clie", BOTH)])
-def test_the_jacobian_of_sensor_rows_is_that_of_differences(method, rows):
+def test_sensor_jacobian_is_of_differences(method, rows):
+    """The Jacobian of sensor rows is that of differences."""
     problem, truth = sensed(rows, 0, 0.0)
     task = comparison(problem, method)
     start = task.whole(truth, np.array([0.2, 0.1]))
@@ -41,7 +42,8 @@ def test_the_jacobian_of_sensor_rows_is_that_of_differences(method, rows):
 @pytest.mark.parametrize(
     ("method", "rows"), [("cloe", LINK), ("cloe", BOTH), ("clie", BOTH), ("iv", BOTH), ("didim", LINK)]
 )
-def test_a_payload_stack_with_sensors_is_recovered_within_sigma(method, rows):
+def test_payload_with_sensors_within_sigma(method, rows):
+    """A stack of recordings with payload and sensors is recovered within sigma."""
     away = []
     for seed in range(3):
         problem, truth = sensed(rows, seed, 1e-4)
@@ -63,7 +65,8 @@ LOOP = LoopSettings(controller="pd", kp=(1.0,), kd=(1.0,))
         ("didim", DRIVE, "wls pc-wls tls", "iv pc-didim"),
     ],
 )
-def test_torque_rows_that_a_method_does_not_take_are_refused_with_all_that_do(method, rows, works, fails):
+def test_foreign_torque_rows_are_refused(method, rows, works, fails):
+    """Torque rows that a method does not take are refused with all that do."""
     settings = IdentificationSettings(method=method, torque_rows=rows, loop=LOOP)
     with pytest.raises(UsageError, match=f"rows = '{rows.name}' is not supported; methods that support it: ") as caught:
         require_usable(settings, METHODS[method])
@@ -82,7 +85,8 @@ def test_friction_is_what_the_method_takes():
         require_usable(replace(auto, friction="stribeck"), METHODS["ukf"])
 
 
-def test_friction_without_derivatives_is_refused_by_name():
+def test_friction_without_slopes_is_refused():
+    """Friction without derivatives is refused by name."""
     from calib.dynamics import drives
     from calib.dynamics.shapes import RecordedRange
 

@@ -41,7 +41,8 @@ def rounded(q: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("shift", [3, -2])
-def test_a_reference_is_moved_to_where_the_torques_say_it_was_played(shift):
+def test_reference_moves_to_its_playback(shift):
+    """A reference is moved to where the torques say that it was played."""
     right, moved = closed(), closed(shift, "estimated")
     (_, one), (_, other) = right.pairs[0], moved.pairs[0]
     inside = slice(100, -100)
@@ -58,14 +59,15 @@ def test_a_reference_is_moved_to_where_the_torques_say_it_was_played(shift):
      ({"copied": rounded}, "is the measured positions: "),
      ({"copied": np.array, "shift": 2}, "measured positions, 10 ms later")],
 )  # fmt: skip
-def test_a_late_or_copied_reference_is_refused(how, says):
+def test_late_or_copied_reference_is_refused(how, says):
+    """A late or copied reference is refused."""
     with pytest.raises(MeasurementError, match=says):
         closed(**how)
     if "copied" not in how:
         assert closed(**how, timing="stated").pairs
 
 
-def test_a_wrong_bandwidth_is_not_taken_for_a_delay():
+def test_wrong_bandwidth_is_no_delay():
     """A third of the bandwidth is enough for instrumental variables."""
     kp, kd = small_arm.LOOP.kp, small_arm.LOOP.kd
     assert closed(kp=tuple(np.divide(kp, 9.0)), kd=tuple(np.divide(kd, 3.0))).pairs

@@ -38,7 +38,7 @@ def recorded() -> tuple[controllers.Reference, np.ndarray, Case]:
 
 
 @pytest.mark.parametrize("share", [0.8, 1.0])
-def test_the_replay_tells_how_the_true_robot_would_track(share):
+def test_replay_tracks_as_the_true_robot(share):
     """A model whose friction falls short, fed forward on the true robot, pushed as it was: the same rms within 10 %."""
     _, push, case = recorded()
     values = planted.truth()
@@ -58,7 +58,8 @@ def test_the_replay_tells_how_the_true_robot_would_track(share):
 
 
 @pytest.mark.slow
-def test_better_models_track_better_and_cad_knows_no_friction():
+def test_better_models_track_better():
+    """Better models track better, and the CAD knows no friction."""
     _, _, case = recorded()
     errors = []
     for factor in (0.5, 0.8, 1.0):
@@ -69,7 +70,7 @@ def test_better_models_track_better_and_cad_knows_no_friction():
     assert errors[0] > errors[1] > errors[2]
 
 
-def test_a_model_of_no_possible_robot_is_replayed_with_inertia_added_and_that_told():
+def test_impossible_model_gets_inertia_added():
     """Motor inertia off the last joint until its own is negative: errors of the true robot's are met within a third."""
     _, push, case = recorded()
     values = planted.truth()
@@ -98,7 +99,8 @@ def test_the_command_reports_it(robot, tmp_path, capsys):
     assert "reduces the tracking error by" in capsys.readouterr().out
 
 
-def test_no_ratio_is_told_of_a_model_that_is_no_possible_robot():
+def test_no_ratio_for_an_impossible_robot():
+    """No ratio is told of a model that is no possible robot."""
     from calib.procedure.report.dynamics_section import tracking_blocks
 
     def said(*added: float) -> str:

@@ -10,15 +10,15 @@ from calib.simulation import known_robots
 
 
 @pytest.mark.parametrize(("stable", "share"), [(0.6, 0.5), (0.3, 0.25), (0.02, 2.0**-6)])
-def test_the_step_is_halved_until_the_loop_is_stable(
-    monkeypatch: pytest.MonkeyPatch, stable: float, share: float
-) -> None:
+def test_step_is_halved_until_stable(monkeypatch: pytest.MonkeyPatch, stable: float, share: float) -> None:
+    """The step is halved until the loop is stable."""
     start, end = step(monkeypatch, stable)
     plant, runs = simulated_runs.nearer(start, end, [])
     assert runs == [] and plant.parameters[0] == share
 
 
-def test_where_no_part_of_the_step_is_stable_that_is_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unstable_steps_are_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where no part of the step is stable, that is the error."""
     start, end = step(monkeypatch, 0.0)
     with pytest.raises(
         CannotSimulate, match="no parameters between the start and the estimate can be simulated: unstable"

@@ -65,7 +65,7 @@ def log(rows, seed: int = 0):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("rows", [BOTH, LINK])
-def test_instruments_are_right_with_sensors_where_least_squares_is_biased(rows):
+def test_instruments_with_sensors_are_right(rows):
     """Measured over seeds 0 to 7: where least squares is beyond 5 of its σ, IV is within 1.4 of its own.
 
     These are 15 to 20 of 92 parameters (up to 17 σ off), of link rows alone 7 to 12 of 64; IV errs there by 1 to 3 %
@@ -84,7 +84,8 @@ def test_instruments_are_right_with_sensors_where_least_squares_is_biased(rows):
     assert found.valid and found.explains and found.verdict.biased() and not len(found.off)
 
 
-def test_rows_without_bodies_have_no_instruments():
+def test_bodiless_rows_have_no_instruments():
+    """Rows without bodies have no instruments."""
     model = replace(model_of(BOTH)[0], torque_rows=DRIVE)
     base = bases.find(model)
     with pytest.raises(UsageError, match="rows motor, link or both"):

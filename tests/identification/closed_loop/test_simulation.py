@@ -48,7 +48,8 @@ def free(n: int) -> controllers.LoopController:
 @pytest.mark.parametrize("chain", [description.read(library.path(x)) for x in ("tx40", "lwr4plus")]
                          + [motley_with_follower()],
                          ids=lambda chain: chain.name)  # fmt: skip
-def test_forward_dynamics_undo_inverse_dynamics_with_drives(chain):
+def test_forward_undoes_inverse_dynamics(chain):
+    """Forward dynamics undo inverse dynamics with drives."""
     bodies = bodies_of(chain)
     bodies = with_payload(bodies, displace(np.eye(4), np.full(6, 0.2)), "load")
     terms = drives.standard(["Ia Fv Fc off"] * chain.n, 0.05)
@@ -72,7 +73,8 @@ def test_motors_and_couplings_add_inertia():
     assert added[4, 5] == added[5, 4] == 7.0 and added[2, 2] == 3.0
 
 
-def test_it_runs_like_pinocchios_aba_under_rk4():
+def test_simulation_runs_like_pinocchio():
+    """The simulation runs like Pinocchio's ABA under RK4."""
     import pinocchio_model as model
 
     chain = description.read(library.path("tx40"))
@@ -94,7 +96,8 @@ def test_it_runs_like_pinocchios_aba_under_rk4():
     assert np.abs(run.v[-1] - x[6:]).max() < 1e-9
 
 
-def test_energy_stays_without_friction_and_controller_and_the_drift_falls_with_the_fourth_power():
+def test_energy_drift_is_of_fourth_order():
+    """Without friction and controller the energy stays, and its drift falls with the fourth power."""
     import pinocchio as pin
     from pinocchio_model import model
 
@@ -114,14 +117,16 @@ def test_energy_stays_without_friction_and_controller_and_the_drift_falls_with_t
     assert 10.0 < coarse / fine < 64.0
 
 
-def test_what_is_recorded_obeys_the_model_to_rounding():
+def test_recording_obeys_the_model():
+    """What is recorded obeys the model to rounding."""
     plant = known_robots.plant("tx40", coupled=True, offset=np.full(6, 0.2))
     run = simulate(plant, known_robots.controller("tx40"), motion(), Sensing(1e-6, 1e-6, 0.0, 0.0, every=5), seed=2)
     tau = np.einsum("kij,j->ki", known_robots.model(plant).regressor(run.q, run.v, run.a), plant.parameters)
     assert np.abs(tau - run.torque).max() < 1e-11 * np.abs(run.torque).max()
 
 
-def test_friction_holds_without_chatter_where_explicit_steps_are_too_long():
+def test_friction_holds_without_chatter():
+    """Friction holds without chatter where explicit steps are too long."""
     plant, controller = known_robots.plant("tx40"), known_robots.controller("tx40")
     known = known_robots.truth("tx40")["drives"]
     stiffness = known["Fc"][5] / known["v0"] / plant.inertia_diagonal(np.zeros((1, 6)))[5]
@@ -134,7 +139,7 @@ def test_friction_holds_without_chatter_where_explicit_steps_are_too_long():
     assert np.all(np.abs(np.diff(np.sign(run.v[late]), axis=0)).sum(axis=0) <= 2)
 
 
-def test_computed_torque_makes_a_pendulum_of_every_joint():
+def test_computed_torque_makes_pendulums():
     """Without friction the error obeys ë + 2 ζ ω ė + ω² e = 0, up to the sampling."""
     chain = description.read(library.path("tx40"))
     plant, reference = bare(chain), still(np.zeros(6), 0.5, 20000.0)
@@ -167,7 +172,8 @@ def test_sensing_and_actuation_are_as_stated():
     assert np.any(undelayed.torque[1] != undelayed.torque[0])
 
 
-def test_the_seed_repeats_a_run_to_the_last_bit():
+def test_seed_repeats_a_run_exactly():
+    """The seed repeats a run to the last bit."""
     plant, controller, reference = known_robots.plant("rv2sq"), known_robots.controller("rv2sq"), motion(duration=0.2)
     sensing = Sensing(1e-6, 0.0, 0.05, 0.5, push_band=20.0)
     one, again, other = (simulate(plant, controller, reference, sensing, seed) for seed in (4, 4, 5))
@@ -197,7 +203,7 @@ EVERYTHING = {
 
 
 @pytest.mark.parametrize("shape", EVERYTHING)
-def test_all_friction_that_identification_knows_can_be_simulated(shape):
+def test_all_known_friction_is_simulated(shape):
     """What is recorded obeys the identification model.
 
     Within what a sampled record tells of turning points, where friction depends on them; and but for the edge of a dead
@@ -219,7 +225,7 @@ def test_all_friction_that_identification_knows_can_be_simulated(shape):
     assert away[~edge].max() < close * np.abs(run.torque).max() and edge.mean() < 0.5
 
 
-def test_samples_may_fall_between_control_periods():
+def test_samples_between_control_periods():
     """5 kHz and 140 Hz: 35.7 periods; half periods agree with whole ones, others with the motion in between."""
     plant, controller, reference = known_robots.plant("tx40"), known_robots.controller("tx40"), motion(duration=0.5)
     whole, between = (simulate(plant, controller, reference, Sensing(every=x)) for x in (5, 2.5))
@@ -232,7 +238,8 @@ def test_samples_may_fall_between_control_periods():
     assert np.abs(tau - slow.torque).max() < 1e-10 * np.abs(slow.torque).max()
 
 
-def test_every_sample_may_have_parameters_of_its_own():
+def test_samples_may_vary_in_parameters():
+    """Every sample may have parameters of its own."""
     plant = known_robots.plant("tx40", coupled=True, offset=np.full(6, 0.2))
     rng = np.random.default_rng(0)
     q, v, tau = rng.normal(size=(3, 4, 6))
@@ -243,7 +250,8 @@ def test_every_sample_may_have_parameters_of_its_own():
     assert np.array_equal(forward_dynamics(plant, q, v, tau, values), np.array(alone))
 
 
-def test_references_are_their_own_derivatives_and_keep_the_limits():
+def test_references_match_their_derivatives():
+    """References are their own derivatives and keep the limits."""
     moves = known_robots.trapezoidal(np.array([[0.0, 0.0], [1.0, -0.2], [0.5, 2.0]]), np.array([1.0, 2.0]), 5.0, 1000.0)
     wave = known_robots.random_fourier(-HIGH, HIGH, np.full(6, 2.0), 5.0, 1000.0, acceleration=15.0, seed=3)
     for reference, close in ((moves, 6e-3), (wave, 1e-4)):
@@ -262,7 +270,8 @@ def test_the_truths_are_those_of_the_library():
         assert known_robots.controller(name).kp.shape == (chain.n,)
 
 
-def test_the_robot_follows_and_feed_forward_of_the_better_model_pays():
+def test_better_feed_forward_pays():
+    """The robot follows, and feed-forward of the better model pays."""
     plant, controller, reference = known_robots.plant("tx40"), known_robots.controller("tx40"), motion()
     rough = replace(plant, parameters=1.2 * plant.parameters)
     ahead = (None, feed_forward(rough, reference), feed_forward(plant, reference))

@@ -54,7 +54,8 @@ LOOPS = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", LOOPS)
-def test_tangents_are_the_derivative_of_the_simulation(name):
+def test_tangents_are_simulation_derivatives(name):
+    """Tangents are the derivative of the simulation."""
     plant, (controller, delay, cutoff) = odd(), LOOPS[name]
     controller, reference = replace(controller, delay=delay, cutoff=cutoff), motion(5)
     columns = np.arange(len(plant.parameters))[::3]
@@ -115,7 +116,7 @@ def test_a_loop_that_diverges_says_so():
 
 
 @pytest.mark.slow  # as above
-def test_a_loop_that_saturation_alone_keeps_finite_is_said_to_be_unstable():
+def test_saturated_loop_is_called_unstable():
     """Its simulation ends; its slopes grow without bounds, and no method may be given them."""
     plant, controller = known_robots.plant("rv2sq"), known_robots.controller("rv2sq")
     rate = 5000.0

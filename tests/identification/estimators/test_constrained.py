@@ -19,7 +19,8 @@ def problem(seed: int, p: int = 8, count: int = 100):
 
 @pytest.mark.parametrize("equal", [0, 2])
 @pytest.mark.parametrize("seed", range(8))
-def test_linear_constraints_give_the_optimum_of_cvxpy_and_prove_it(seed, equal):
+def test_linear_constraints_reach_optimum(seed, equal):
+    """Linear constraints give the optimum of cvxpy and prove it."""
     cvxpy = pytest.importorskip("cvxpy")
     matrix, target, rng = problem(seed)
     unit = np.linalg.norm(matrix, axis=0)
@@ -58,7 +59,8 @@ def covariance(found, triangle):
 
 
 @pytest.mark.parametrize("bound", [1e9, np.inf])
-def test_satisfied_constraints_leave_least_squares_and_its_covariance(bound):
+def test_satisfied_constraints_leave_ols(bound):
+    """Satisfied constraints leave least squares and its covariance."""
     matrix, target, _ = problem(2)
     data = collect(matrix, target)
     found, free = within(combine(data), np.eye(8), np.full(8, -bound), np.full(8, bound)), ols(data).estimate
@@ -67,7 +69,8 @@ def test_satisfied_constraints_leave_least_squares_and_its_covariance(bound):
     assert not found.binding.any()
 
 
-def test_a_binding_parameter_has_no_variance_and_the_others_that_of_the_rest():
+def test_binding_parameter_has_no_variance():
+    """A binding parameter has no variance, and the others have that of the rest."""
     rng = np.random.default_rng(4)
     matrix = rng.normal(size=(200, 3))
     target = matrix @ [1.0, -2.0, 3.0] + rng.normal(size=200)
@@ -80,7 +83,7 @@ def test_a_binding_parameter_has_no_variance_and_the_others_that_of_the_rest():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_positive_definite_matrix_gives_the_optimum_of_cvxpy_and_proves_it(seed):
+def test_definite_matrix_reaches_the_optimum(seed):
     """[[b0, b1], [b1, b2]] ⪰ 0.01 with 2 b0 >= 1.5 beside it, by another solver."""
     cvxpy = pytest.importorskip("cvxpy")
     rng = np.random.default_rng(seed)
@@ -100,7 +103,7 @@ def test_a_positive_definite_matrix_gives_the_optimum_of_cvxpy_and_proves_it(see
     assert found.normals[found.binding] @ covariance(found, triangle) == pytest.approx(0.0, abs=1e-12)
 
 
-def test_of_many_definite_matrices_those_that_matter_give_the_optimum_of_all():
+def test_many_matrices_reach_the_optimum():
     """Twin eigenvalues on the bound and matrices that follow one another closely do not stop it; any start will do."""
     rng = np.random.default_rng(1)
     p, n, count = 12, 4, 400
@@ -121,7 +124,8 @@ def test_of_many_definite_matrices_those_that_matter_give_the_optimum_of_all():
     assert again.values == pytest.approx(found.values, abs=1e-3 * np.abs(found.values).max())
 
 
-def test_matrices_that_no_point_makes_definite_are_refused():
+def test_never_definite_matrices_are_refused():
+    """Matrices that no point makes definite are refused."""
     matrix, target, _ = problem(5, p=3)
     cone = np.array([[[1, 0, 0], [0, 1, 0]], [[0, 1, 0], [0, 0, 1]]], dtype=float)
     with pytest.raises(NotConverged, match="Infeasible"):
@@ -131,7 +135,8 @@ def test_matrices_that_no_point_makes_definite_are_refused():
         )  # fmt: skip
 
 
-def test_contradicting_constraints_and_crossed_bounds_are_refused():
+def test_clashing_constraints_are_refused():
+    """Contradicting constraints and crossed bounds are refused."""
     matrix, target, _ = problem(5)
     triangle = combine(collect(matrix, target))
     apart = np.vstack([np.eye(8)[:1], -np.eye(8)[:1]])
@@ -171,7 +176,7 @@ def from_free_holding(moments: np.ndarray, free: np.ndarray, fixed: np.ndarray, 
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_gourieroux_and_monfort_lead_from_the_free_estimate_to_the_solvers(seed):
+def test_gourieroux_monfort_meets_the_solver(seed):
     """With the constraints that bind as equalities, in the general form; with held parameters, in the partition's."""
     matrix, target, _ = problem(seed)
     triangle, free = combine(collect(matrix, target)), np.linalg.lstsq(matrix, target)[0]
@@ -183,7 +188,8 @@ def test_gourieroux_and_monfort_lead_from_the_free_estimate_to_the_solvers(seed)
     assert other * unit == pytest.approx(found.values * unit, abs=1e-6 * np.linalg.norm(target))
 
 
-def test_the_slides_relation_for_instruments_is_not_the_optimum_of_two_stage_least_squares():
+def test_slides_relation_is_not_the_optimum():
+    """The slides' relation for instruments is not the optimum of two-stage least squares."""
     rng = np.random.default_rng(0)
     instruments = rng.normal(size=(400, 3))
     matrix = instruments + 0.5 * rng.normal(size=(400, 3)) @ rng.normal(size=(3, 3))
@@ -201,7 +207,8 @@ def test_the_slides_relation_for_instruments_is_not_the_optimum_of_two_stage_lea
     assert np.abs(slides - solved.values).max() > 1e-4
 
 
-def test_the_restricted_covariance_is_that_of_estimates_over_many_noises():
+def test_restricted_covariance_over_noises():
+    """The restricted covariance is that of estimates over many noises."""
     rng = np.random.default_rng(3)
     matrix, normals = rng.normal(size=(60, 4)), np.array([[1.0, -1.0, 0.0, 0.0]])
     triangles = [combine(collect(matrix, matrix @ np.ones(4) + rng.normal(size=60))) for _ in range(3000)]
@@ -212,7 +219,8 @@ def test_the_restricted_covariance_is_that_of_estimates_over_many_noises():
     assert normals @ covariance == pytest.approx(np.zeros((1, 4)), abs=1e-15)
 
 
-def test_equalities_that_contradict_or_determine_everything_are_refused():
+def test_degenerate_equalities_are_refused():
+    """Equalities that contradict or determine everything are refused."""
     matrix, target, _ = problem(5)
     triangle = combine(collect(matrix, target))
     twice, values = np.vstack([np.eye(8)[:1], 2.0 * np.eye(8)[:1]]), np.array([1.0, 3.0])

@@ -29,7 +29,8 @@ def value(found, name: str) -> float:
 
 
 @pytest.mark.parametrize("name", FREE)
-def test_constraints_that_do_not_bind_change_nothing(problem, name):
+def test_idle_constraints_change_nothing(problem, name):
+    """Constraints that do not bind change nothing."""
     held, free = METHODS[name].estimate(problem), METHODS[FREE[name]].estimate(problem)
     moved = (held.estimate.values - free.estimate.values) / free.estimate.sigma
     assert np.abs(moved).max() < 0.02
@@ -38,7 +39,8 @@ def test_constraints_that_do_not_bind_change_nothing(problem, name):
 
 
 @pytest.mark.parametrize("name", FREE)
-def test_a_bound_that_excludes_the_truth_holds_and_is_told(problem, name):
+def test_bound_against_the_truth_is_told(problem, name):
+    """A bound that excludes the truth holds, and is told."""
     free = METHODS[FREE[name]].estimate(problem)
     limit = 1.2 * value(free, "Fv1")
     found = METHODS[name].estimate(asked(problem, bounds={"Fv1": (limit, np.inf)}))
@@ -52,7 +54,7 @@ def test_a_bound_that_excludes_the_truth_holds_and_is_told(problem, name):
     assert [one.code for one in found.held.findings] == ["on-its-bound"]
 
 
-def test_ordinary_least_squares_weighs_no_row_and_weighted_does(problem):
+def test_ols_weighs_no_row_and_wls_does(problem):
     """PC-OLS minimises ‖y - W x‖² with the covariance σ² (WᵀW)⁻¹, PC-WLS that of whitened rows."""
     limit = 1.5 * value(METHODS["wls"].estimate(problem), "Fv1")
     wanted = asked(problem, bounds={"Fv1": (limit, np.inf)}, inertia=0)
@@ -65,14 +67,15 @@ def test_ordinary_least_squares_weighs_no_row_and_weighted_does(problem):
         assert np.abs(slope / np.linalg.norm(triangle[:p, :p], axis=0)).max() < 1e-6 * np.linalg.norm(triangle[:p, p])
 
 
-def test_an_equality_between_parameters_holds_and_disagreement_is_told(problem):
+def test_equality_holds_and_conflict_is_told(problem):
+    """An equality between parameters holds, and disagreement is told."""
     same = WeightedSum({"Fv1": 1.0, "Fv2": -1.0}, equal=0.0, name="joints alike")
     found = METHODS["pc-wls"].estimate(asked(problem, sum=(same,)))
     assert value(found, "Fv1") == pytest.approx(value(found, "Fv2"), rel=1e-9)
     assert found.held is not None and [one.code for one in found.held.findings] == ["against-equality"]
 
 
-def test_a_robot_that_cannot_be_is_made_one_that_can(problem):
+def test_impossible_robot_is_made_possible(problem):
     """A bound that wants an inertia away makes M(q) indefinite; held definite, every posture's least eigenvalue is."""
     pulled = {"ZZ2R": (-np.inf, -0.2 * value(METHODS["wls"].estimate(problem), "ZZ2"))}
     loose = METHODS["pc-wls"].estimate(asked(problem, bounds=pulled, inertia=0))
@@ -101,12 +104,13 @@ def test_a_robot_that_cannot_be_is_made_one_that_can(problem):
         ({"sum": (WeightedSum({"Fv1": 1.0, "Fv2": 1.0}),)}, "expected equal, or least <= most"),
     ],
 )
-def test_constraints_that_cannot_be_are_refused_with_their_names(problem, settings, words):
+def test_impossible_constraints_are_named(problem, settings, words):
+    """Constraints that cannot be are refused with their names."""
     with pytest.raises(UsageError, match=words):
         METHODS["pc-wls"].estimate(asked(problem, **settings))
 
 
-def test_bounds_that_no_definite_inertia_meets_are_a_failure_that_says_so(problem):
+def test_bounds_without_possible_robot_fail(problem):
     """The last joint's own inertia, its entry of M(q) in every posture, below zero."""
     last = WeightedSum({"ZZ3": 1.0, "Ia3": 1.0}, most=-1.0)
     found = METHODS["pc-wls"].estimate(asked(problem, sum=(last,), signs=False))
@@ -114,7 +118,7 @@ def test_bounds_that_no_definite_inertia_meets_are_a_failure_that_says_so(proble
 
 
 @pytest.mark.parametrize("name", ["pc-ols", "pc-wls"])
-def test_bodies_that_cannot_exist_are_held_to_the_border_of_those_that_can(problem, name):
+def test_impossible_bodies_go_to_the_border(problem, name):
     """The optimum of cvxpy over standard parameters with P_i >= 0, what no torque tells of them free."""
     cp = pytest.importorskip("cvxpy")
     free = METHODS["wls"].estimate(problem)
@@ -141,7 +145,8 @@ def test_bodies_that_cannot_exist_are_held_to_the_border_of_those_that_can(probl
     assert np.abs((held.estimate.values - beta.value) * size).max() < 2e-2 * scale
 
 
-def test_bodies_that_exist_are_left_alone_and_impossible_bounds_are_told(problem):
+def test_possible_bodies_are_unchanged(problem):
+    """Bodies that exist are left alone, and impossible bounds are told."""
     free = METHODS["wls"].estimate(problem)
     held = METHODS["pc-wls"].estimate(asked(problem, bodies=True))
     assert held.held is not None and not any("bodies" in name for name in held.held.names)
@@ -151,7 +156,8 @@ def test_bodies_that_exist_are_left_alone_and_impossible_bounds_are_told(problem
     assert not found.found and "no physically consistent bodies satisfy 1 ZZ3 + 1 Ia3 <= -1" in str(found.failure)
 
 
-def test_a_sum_of_standard_parameters_that_the_torques_tell_is_its_base_parameter(problem):
+def test_told_sum_is_its_base_parameter(problem):
+    """A sum of standard parameters that the torques tell is its base parameter."""
     base = problem.base
     name = next(name for name, row in zip(base.names, base.split.coefficients) if np.abs(row).max() > 1e-6)
     row = base.transform[base.names.index(name)]
@@ -160,7 +166,8 @@ def test_a_sum_of_standard_parameters_that_the_torques_tell_is_its_base_paramete
     assert made.matrix[0] == pytest.approx(np.eye(base.b)[base.names.index(name)])
 
 
-def test_the_options_file_says_them_and_other_methods_refuse_them():
+def test_options_file_states_constraints():
+    """The options file states the constraints, and other methods refuse them."""
     text = """
     method = "pc-wls"
     friction = "standard"
@@ -182,7 +189,8 @@ def test_the_options_file_says_them_and_other_methods_refuse_them():
         parse_options({"constraints": {"bounds": {"Fv1": [float("nan"), 1.0]}}})
 
 
-def test_definite_inertia_gives_the_optimum_of_cvxpy(problem):
+def test_definite_inertia_reaches_optimum(problem):
+    """Definite inertia gives the optimum of cvxpy."""
     cvxpy = pytest.importorskip("cvxpy")
     limit = -0.2 * value(METHODS["wls"].estimate(problem), "ZZ2")
     made = constraints_of(asked(problem, bounds={"ZZ2R": (-np.inf, limit)}, inertia=6, signs=False))

@@ -31,7 +31,7 @@ def held(problem, name: str = "pc-wls", /, *curved: CurvedConstraint, **settings
 
 
 @pytest.mark.parametrize("formula", [CIRCLE, "Fv1 * Fv2 <= 1", "exp(Fv3) - sqrt(ZZ2R) * ZZ2R >= 3"])
-def test_the_optimum_is_that_of_a_solver_for_any_function(problem, formula):
+def test_optimum_is_that_of_general_solver(problem, formula):
     """Sequential quadratic programming of scipy, from the free estimate; and the estimate says what holds it."""
     found = held(problem, "pc-wls", CurvedConstraint(formula), inertia=0, signs=False)
     names = list(found.estimate.names)
@@ -56,7 +56,8 @@ def test_the_optimum_is_that_of_a_solver_for_any_function(problem, formula):
 
 
 @pytest.mark.parametrize("name", ["pc-ols", "pc-wls", pytest.param("pc-irls", marks=pytest.mark.slow)])
-def test_a_function_with_its_derivatives_is_its_formula(problem, name):
+def test_function_equals_its_formula(problem, name):
+    """A function with its derivatives is its formula."""
     stated = held(problem, name, CurvedConstraint(circle, slope))
     formula = held(problem, name, CurvedConstraint(CIRCLE))
     assert np.allclose(stated.estimate.values, formula.estimate.values, rtol=1e-6, atol=1e-9)
@@ -68,13 +69,15 @@ def test_a_function_with_its_derivatives_is_its_formula(problem, name):
     assert spread @ stated.estimate.covariance[np.ix_(places, places)] @ spread < 1e-12
 
 
-def test_one_that_does_not_bind_changes_nothing(problem):
+def test_idle_function_changes_nothing(problem):
+    """A function that does not bind changes nothing."""
     found, free = held(problem, "pc-wls", CurvedConstraint("Fv1 * Fv2 >= 1")), held(problem)
     assert np.allclose(found.estimate.values, free.estimate.values, rtol=1e-9)
     assert not found.held.binding and "Fv1 * Fv2 >= 1" in found.held.names
 
 
-def test_it_holds_beside_bodies_bounds_and_another(problem):
+def test_curved_holds_beside_others(problem):
+    """A curved constraint holds beside bodies, bounds and another one."""
     curved = (CurvedConstraint(CIRCLE), CurvedConstraint("ZZ2R * ZZ3 >= 0.2"))
     found = held(problem, "pc-wls", *curved, bounds={"Fv3": (0.9, np.inf)}, bodies=True)
     value = dict(zip(found.estimate.names, found.estimate.values))
@@ -110,7 +113,8 @@ def test_what_is_no_constraint_is_refused(problem, curved, words):
 
 
 @pytest.mark.parametrize("formulas", [("Fv1**2 <= -1",), ("Fv1 * Fv2 <= 1", "Fv1 * Fv2 >= 1.2")])
-def test_constraints_that_no_estimate_satisfies_are_a_failure_that_says_so(problem, formulas):
+def test_unsatisfiable_constraints_fail(problem, formulas):
+    """Constraints that no estimate satisfies are a failure that says so."""
     found = held(problem, "pc-wls", *(CurvedConstraint(one) for one in formulas))
     assert not found.found
     assert f"no estimate satisfies {formulas[0]}" in str(found.failure) and "h of '" in str(found.failure)

@@ -23,7 +23,7 @@ def planted(seed: int, count: int = 300, outliers: float = 0.0, size: float = 10
     return matrix, target, bad
 
 
-def test_it_is_the_textbook_formula_with_the_noise_and_the_weights_found():
+def test_formula_uses_estimated_weights():
     """Rows cut from single joints are whitened with their own part of the covariance."""
     matrix, target, _ = planted(1)
     present = np.random.default_rng(1).random(target.shape) < 0.7
@@ -37,7 +37,8 @@ def test_it_is_the_textbook_formula_with_the_noise_and_the_weights_found():
     assert found.estimate.dof == present[found.weights > 0].sum() - 4
 
 
-def test_the_covariance_across_joints_is_found():
+def test_covariance_across_joints_is_found():
+    """The covariance across joints is found."""
     found = irls(stack(*planted(2, 4000)[:2]))
     std = np.sqrt(np.diag(NOISE))
     assert np.abs((found.noise - NOISE) / np.outer(std, std)).max() < 0.08
@@ -49,7 +50,9 @@ def by_joint(data):
     return wls(collect(*rows, np.tile(np.arange(data.target.shape[1]), len(data.target))))
 
 
-def test_correlated_joints_tell_more_together():
+def test_correlated_joints_tell_more():
+    """Correlated joints tell more together."""
+
     def spread(fit):
         return np.mean([(fit(stack(*planted(s, 100)[:2])).estimate.values - TRUTH) ** 2 for s in range(60)], axis=0)
 
@@ -58,7 +61,8 @@ def test_correlated_joints_tell_more_together():
 
 
 @pytest.mark.parametrize("seeds", [50, pytest.param(120, marks=pytest.mark.slow)])
-def test_the_covariance_of_the_estimate_is_true_on_normal_noise(seeds):
+def test_covariance_is_true_on_normal_noise(seeds):
+    """The covariance of the estimate is true on normal noise."""
     sizes = []
     for seed in range(seeds):
         found = irls(stack(*planted(seed, 120)[:2])).estimate
@@ -67,7 +71,8 @@ def test_the_covariance_of_the_estimate_is_true_on_normal_noise(seeds):
     assert np.mean(sizes) == pytest.approx(4.0, abs=4 * np.sqrt(8 / seeds) + 0.2)
 
 
-def test_ten_percent_of_gross_outliers_are_found_and_do_no_harm():
+def test_ten_percent_outliers_do_no_harm():
+    """Ten percent of gross outliers are found, and do no harm."""
     harm, clean, sizes = [], [], []
     root = np.linalg.inv(np.linalg.cholesky(NOISE))
     for seed in range(40):
@@ -86,7 +91,8 @@ def test_ten_percent_of_gross_outliers_are_found_and_do_no_harm():
     assert np.mean((spoilt.values - TRUTH) ** 2) > 20 * np.mean(clean)
 
 
-def test_outliers_that_leave_each_joint_plausible_are_seen_by_their_combination():
+def test_outliers_show_by_their_combination():
+    """Outliers that leave each joint plausible are seen by their combination."""
     matrix, target, _ = planted(5, 400)
     target[:20] = matrix[:20] @ TRUTH + [2.2, -2.2, 0.0]  # 2.2 sigma each, ten together, as the joints go in step
     found = irls(stack(matrix, target))
@@ -94,7 +100,8 @@ def test_outliers_that_leave_each_joint_plausible_are_seen_by_their_combination(
     assert found.outliers[20:].mean() < 0.02
 
 
-def test_outliers_of_single_joints_are_put_aside_row_by_row():
+def test_single_joint_outliers_go_by_row():
+    """Outliers of single joints are put aside row by row."""
     matrix, target, _ = planted(6, 400)
     hit = np.random.default_rng(6).random(target.shape) < 0.1
     target = target + 60.0 * hit
@@ -103,12 +110,14 @@ def test_outliers_of_single_joints_are_put_aside_row_by_row():
     assert np.abs(by_joint(stack(matrix, target)).estimate.values - TRUTH).max() > np.abs(error).max()
 
 
-def test_the_constant_of_one_joint_is_the_well_known_one_and_grows_with_the_joints():
+def test_constant_grows_with_the_joints():
+    """The constant of one joint is the well-known one, and grows with the joints."""
     assert tuning(1) == pytest.approx(1.345, abs=5e-3)
     assert np.all(np.diff([tuning(n) for n in range(1, 8)]) > 0)
 
 
-def test_inflation_widens_the_covariance_and_lowers_the_degrees_of_freedom():
+def test_inflation_widens_covariance():
+    """Inflation widens the covariance and lowers the degrees of freedom."""
     data = stack(*planted(7)[:2])
     plain, wide = irls(data), irls(data, inflation=4.0)
     assert wide.estimate.covariance == pytest.approx(4.0 * plain.estimate.covariance)

@@ -19,13 +19,15 @@ def planted(seed: int, count: int = 400, noise: np.ndarray = NOISE, scale: float
     return spoilt[:, :3], spoilt[:, 3]
 
 
-def test_all_columns_alike_is_the_smallest_singular_vector():
+def test_equal_noise_gives_singular_vector():
+    """With noise alike in all columns the estimate is the smallest singular vector."""
     matrix, target = planted(1)
     v = np.linalg.svd(np.column_stack([matrix, target]))[2][-1]
     assert tls(collect(matrix, target), np.ones(4)).estimate.values == pytest.approx(-v[:3] / v[3], rel=1e-9)
 
 
-def test_with_noise_in_y_alone_it_is_ordinary_least_squares_with_its_covariance():
+def test_noise_in_y_alone_is_ols():
+    """With noise in y alone, the estimate is ordinary least squares with its covariance."""
     matrix, target = planted(2)
     data = collect(matrix, target)
     total, ordinary = tls(data, np.array([0.0, 0.0, 0.0, 1.0])).estimate, ols(data).estimate
@@ -33,7 +35,8 @@ def test_with_noise_in_y_alone_it_is_ordinary_least_squares_with_its_covariance(
     assert total.covariance == pytest.approx(ordinary.covariance, rel=1e-8)
 
 
-def test_exact_columns_and_unlike_noise_minimise_the_stated_distance():
+def test_unlike_noise_minimises_the_distance():
+    """Exact columns and unlike noise minimise the stated distance."""
     matrix, target = planted(3)
     found = tls(collect(matrix, target), NOISE).estimate.values
 
@@ -45,7 +48,8 @@ def test_exact_columns_and_unlike_noise_minimise_the_stated_distance():
     assert all(distance(found + 1e-3 * rng.normal(size=3)) > best for _ in range(50))
 
 
-def test_scaling_columns_and_their_noise_scales_the_values_only():
+def test_scaled_columns_scale_values_only():
+    """Scaling columns and their noise scales the values only."""
     matrix, target = planted(4)
     scale = np.array([10.0, 1e-3, 1e4])
     plain = tls(collect(matrix, target), NOISE).estimate
@@ -54,7 +58,8 @@ def test_scaling_columns_and_their_noise_scales_the_values_only():
     assert scaled.covariance * np.outer(scale, scale) == pytest.approx(plain.covariance, rel=1e-6)
 
 
-def test_it_is_unbiased_where_least_squares_is_not_and_its_covariance_is_true():
+def test_tls_is_unbiased_unlike_ols():
+    """Total least squares is unbiased where least squares is not, and its covariance is true."""
     errors, sizes, naive = [], [], []
     for seed in range(300):
         data = collect(*planted(seed))
@@ -87,7 +92,7 @@ def test_rows_of_unlike_noise_weigh_by_it():
     assert np.mean(np.square(errors["plain"])) > 10 * np.mean(np.square(errors["weighted"]))
 
 
-def test_drive_gains_come_from_runs_with_and_without_a_known_payload():
+def test_gains_come_from_a_payload():
     """[V -W] [g; χ] = y with measured currents V and motion W, y the payload's known torque (Gautier & Briot 2014)."""
     rng = np.random.default_rng(8)
     gains, links, sigma = np.array([50.0, 20.0]), np.array([8.0, 1.5, 3.0]), 0.01
@@ -112,7 +117,8 @@ def test_drive_gains_come_from_runs_with_and_without_a_known_payload():
     assert np.abs(naive[:2] / gains - 1).max() > 3 * np.abs(found.values[:2] / gains - 1).max()
 
 
-def test_columns_that_hold_noise_only_are_refused_by_name():
+def test_columns_of_noise_only_are_refused():
+    """Columns that hold noise only are refused by name."""
     rng = np.random.default_rng(9)
     clean = rng.normal(size=400)
     matrix = np.column_stack([clean, np.zeros(400)]) + 0.1 * rng.normal(size=(400, 2))
@@ -120,18 +126,19 @@ def test_columns_that_hold_noise_only_are_refused_by_name():
         tls(collect(matrix, clean + 0.1 * rng.normal(size=400), names=["a", "b"]), np.full(3, 0.1))
 
 
-def test_a_y_that_no_column_needs_dependent_exact_columns_and_wrong_noise_are_refused():
+def test_degenerate_problems_are_refused():
+    """A y that no column needs, dependent exact columns and wrong noise are refused."""
     matrix, target = planted(10)
     with pytest.raises(CalibError, match=r"shape \(4\)"):
         tls(collect(matrix, target), np.ones(3))
     with pytest.raises(CalibError, match="negative"):
         tls(collect(matrix, target), np.array([1.0, 1.0, -1.0, 1.0]))
     twice = np.column_stack([matrix[:, 0], matrix[:, 0], matrix[:, 1]])
-    with pytest.raises(Unidentifiable, match="exact columns"):
+    with pytest.raises(Unidentifiable, match="columns without noise"):
         tls(collect(twice, target), np.array([0.0, 0.0, 1.0, 1.0]))
 
 
-def test_rows_alike_in_time_widen_the_covariance_until_it_covers():
+def test_repeated_rows_widen_the_covariance():
     """Every error stands for four rows: with each of them counted as news, the intervals are half as wide."""
     away = {1.0: [], 4.0: []}
     for seed in range(60):

@@ -18,7 +18,7 @@ NAMES = [("sr" if one.root else "") + one.rule for one in KINDS]
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=NAMES)
-def test_on_a_linear_system_every_filter_is_kalmans(kind):
+def test_linear_system_gives_kalman_filter(kind):
     """Mean and covariance of three steps against the textbook's recursion."""
     rng = np.random.default_rng(0)
     slopes, noise = np.eye(4) + 0.2 * rng.normal(size=(4, 4)), 0.1 * rng.normal(size=(4, 2))
@@ -54,7 +54,8 @@ def test_a_covariance_that_is_none_is_told():
 
 
 @pytest.mark.slow
-def test_six_filters_make_one_estimate_whose_sigma_covers():
+def test_six_filters_agree_within_sigma():
+    """Six filters make one estimate, whose sigma covers its error."""
     away, others = [], []
     for seed in range(3):
         problem = small_arm.problem(seed, 0.0, 0.1, rate=2000.0)
@@ -69,7 +70,8 @@ def test_six_filters_make_one_estimate_whose_sigma_covers():
 
 
 @pytest.mark.slow
-def test_a_filter_finds_back_from_a_start_that_is_off():
+def test_filter_recovers_from_a_wrong_start():
+    """A filter recovers from a start that is off."""
     problem = small_arm.problem(0, 0.0, 0.1, rate=2000.0)
     plain = METHODS["srukf"].estimate(problem)
     off = METHODS["srukf"].estimate(replace(problem, start=1.15 * small_arm.truth()))
@@ -77,7 +79,8 @@ def test_a_filter_finds_back_from_a_start_that_is_off():
 
 
 @pytest.mark.slow
-def test_what_a_filter_cannot_follow_is_a_status():
+def test_unfollowable_motion_is_a_status():
+    """What a filter cannot follow is a status."""
     problem = small_arm.problem(0)
     found = METHODS["ukf"].estimate(replace(problem, start=-small_arm.truth()))
     assert found.status in (EstimateStatus.CANNOT_BE_SIMULATED, EstimateStatus.DIVERGED) and found.failure is not None

@@ -45,20 +45,21 @@ def errors(name: str, problem: IdentificationProblem) -> tuple[np.ndarray, np.nd
 
 
 @pytest.mark.parametrize("noise", [*(pytest.param(noise, marks=pytest.mark.slow) for noise in (0.0, 1e-4)), 3e-4])
-def test_the_stated_sigma_of_maximum_likelihood_covers(noise):
+def test_maximum_likelihood_sigma_covers(noise):
     """Least squares' own is missed by several sigmas at the last level."""
     away = np.array([np.divide(*errors("ml", noisy(seed, noise))) for seed in range(6)])
     assert 0.7 < np.sqrt(np.mean(away**2)) < 1.3
     assert np.mean(np.abs(away) < 2.0) > 0.9
 
 
-def test_maximum_likelihood_is_nearer_the_truth_than_least_squares():
+def test_maximum_likelihood_beats_ols():
+    """Maximum likelihood is nearer the truth than least squares."""
     problem = noisy(0, 1e-3)
     size = {name: np.linalg.norm(errors(name, problem)[0]) for name in ("wls", "tls", "ml")}
     assert size["ml"] < 0.5 * min(size["wls"], size["tls"])
 
 
-def test_generalised_total_least_squares_takes_what_noise_adds_to_the_columns():
+def test_generalised_tls_cures_column_noise():
     """Nearer the truth than least squares and TLS, within its sigma; the same as wls where positions are exact."""
     away = {name: [errors(name, noisy(seed, 3e-4)) for seed in range(3)] for name in ("wls", "tls", "gtls")}
     size = {name: np.mean([np.linalg.norm(error) for error, _ in each]) for name, each in away.items()}
@@ -69,12 +70,14 @@ def test_generalised_total_least_squares_takes_what_noise_adds_to_the_columns():
     assert np.abs((same - errors("wls", exact)[0]) / sigma).max() < 0.05
 
 
-def test_noise_that_hides_the_columns_is_told():
+def test_noise_that_hides_columns_is_told():
+    """Noise that hides the columns is told."""
     found = METHODS["gtls"].estimate(noisy(0, 2e-2))
     assert found.status is EstimateStatus.RANK_DEFICIENT and "noise of the encoders alone" in str(found.failure)
 
 
-def test_intervals_of_bounded_errors_hold_the_truth_and_are_those_of_all_rows():
+def test_bounded_error_intervals_hold_truth():
+    """Intervals of bounded errors hold the truth, and are those of all rows."""
     rng = np.random.default_rng(0)
     for _ in range(4):
         matrix, truth = rng.normal(size=(300, 3)), rng.normal(size=3)
@@ -99,7 +102,8 @@ def test_set_membership_is_certain_and_wide(problem):
     assert (away <= half).all() and np.median(half / plain.estimate.sigma) > 5.0
 
 
-def test_noise_of_filtered_states_is_what_filters_leave_of_white_noise():
+def test_noise_of_filtered_states():
+    """Noise of filtered states is what filters leave of white noise."""
     problem = noisy(0, 3e-4)
     motion = problem.cases[0].motion
     stated = noise_of_states(motion, problem.decimator)
@@ -108,7 +112,7 @@ def test_noise_of_filtered_states_is_what_filters_leave_of_white_noise():
     assert np.allclose(np.array(seen) / [stated[:, 1, 1], stated[:, 2, 2]], 1.0, atol=0.35)
 
 
-def test_the_neuron_minimises_each_sample_along_its_gradient(problem):
+def test_neuron_minimises_along_the_gradient(problem):
     """One step: what is left of that sample's torque is orthogonal to the step; half a step leaves half of it."""
     data, zero = samples_of(problem), np.zeros(problem.pooled.parameters)
     moved = [adaline(data, zero, rate, steps=1) for rate in (1.0, 0.5)]
@@ -118,7 +122,7 @@ def test_the_neuron_minimises_each_sample_along_its_gradient(problem):
     assert np.allclose(moved[1], 0.5 * moved[0])
 
 
-def test_the_neuron_does_not_gain_from_more_data():
+def test_neuron_gains_nothing_from_more_data():
     """The survey's variance above ten times that of least squares: so it is with enough samples, the neuron's stays."""
     rng, truth, spread = np.random.default_rng(0), np.array([1.0, -2.0, 0.5, 3.0]), {}
     for count in (100, 2500):
@@ -135,7 +139,7 @@ def test_the_neuron_does_not_gain_from_more_data():
     assert neuron[1] > 100.0 * plain[1]
 
 
-def test_the_network_rests_at_ordinary_least_squares(problem):
+def test_network_rests_at_least_squares(problem):
     """u' = -W'Wx + W'y, columns of one size and steps enough."""
     triangle, size = combine(problem.pooled), METHODS["ols"].estimate(problem).estimate
     norms = np.linalg.norm(triangle[:-1, :-1], axis=0)
@@ -146,7 +150,8 @@ def test_the_network_rests_at_ordinary_least_squares(problem):
 
 
 @pytest.mark.parametrize("name", ["adaline", "hopfield"])
-def test_the_stated_sigma_of_the_networks_covers_their_error_of_training(name):
+def test_network_sigma_covers_training_error(name):
+    """The stated sigma of the networks covers their error of training."""
     for seed in range(3):
         away = np.divide(*errors(name, noisy(seed, 0.0)))
         assert np.sqrt(np.mean(away**2)) < 1.5
@@ -162,6 +167,7 @@ def test_networks_say_when_they_fail(problem):
     assert found.status is EstimateStatus.NOT_CONVERGED and "smaller rate than 10" in str(found.failure)
 
 
-def test_maximum_likelihood_wants_motor_torques(problem):
+def test_likelihood_wants_motor_torques(problem):
+    """Maximum likelihood wants motor torques."""
     with pytest.raises(UsageError, match="motor torques"):
         METHODS["ml"].estimate(replace(problem, model=replace(problem.model, torque_rows=POWER)))

@@ -26,7 +26,8 @@ def test_the_stated_sigma_covers(name, noise):
 
 
 @pytest.mark.slow
-def test_each_is_better_where_its_own_signal_is_clean():
+def test_each_is_better_on_its_clean_signal():
+    """The method of torques and that of positions are each better where their signal is clean."""
     heard, seen = problem(0, 0.0, 0.1), problem(0, 2e-5, 0.0)
     error = {
         (name, where): np.linalg.norm(METHODS[name].estimate(one).estimate.values - truth())
@@ -37,7 +38,8 @@ def test_each_is_better_where_its_own_signal_is_clean():
 
 
 @pytest.mark.slow
-def test_a_loop_that_cannot_be_followed_is_a_status_not_an_exception():
+def test_unfollowable_loop_is_a_status():
+    """A loop that cannot be followed is a status, not an exception."""
     one = problem(0)
     wild = replace(one, loop=replace(LOOP, kp=(9e6, 6e6), kd=(4e5, 3e5)), start=truth())
     for name in ("cloe", "clie"):
@@ -47,7 +49,8 @@ def test_a_loop_that_cannot_be_followed_is_a_status_not_an_exception():
 
 
 @pytest.mark.slow
-def test_a_start_that_no_robot_has_is_a_status():
+def test_impossible_start_is_a_status():
+    """A start that no robot has is a status."""
     one = problem(0)
     found = METHODS["clie"].estimate(replace(one, start=-truth()))
     assert found.status is EstimateStatus.CANNOT_BE_SIMULATED and "not positive definite" in str(found.failure)
@@ -56,6 +59,7 @@ def test_a_start_that_no_robot_has_is_a_status():
     assert np.abs((near.estimate.values - plain.estimate.values) / plain.estimate.sigma).max() < 0.3
 
 
-def test_without_a_loop_nothing_can_be_compared():
+def test_nothing_is_compared_without_a_loop():
+    """Without a loop nothing can be compared."""
     with pytest.raises(UsageError, match="needs a"):
         METHODS["cloe"].estimate(replace(problem(0), loop=None))

@@ -43,7 +43,8 @@ def amperes(robot: Path) -> Path:
     return out
 
 
-def test_a_model_in_amperes_says_so_in_every_file(amperes):
+def test_ampere_model_says_so_in_every_file(amperes):
+    """A model in amperes says so in every file."""
     metrics, dynamics = (json.loads((amperes / name).read_text()) for name in ("metrics.json", "dynamics.json"))
     assert metrics["unit"] == dynamics["unit"] and dynamics["unit"].startswith("A of joint")
     assert "torques are in amperes, scaled to joint 2" in metrics["warnings"][0] and metrics["tracking_failure"]
@@ -118,7 +119,8 @@ def test_a_regrouped_parameter_has_two_names(robot, tmp_path, name):
     assert first["name"] == "ZZ1" and first["listed"]
 
 
-def test_a_step_whose_terms_the_final_fit_switched_off_is_not_kept():
+def test_switched_off_step_is_dropped():
+    """A step whose terms the final fit switched off is dropped."""
     terms = tuple(drives.term(f"Fs{joint + 1}", "stribeck", joint, 0.1, 1.0, 0.01) for joint in (0, 1))
     step = FrictionTrial("+ stribeck", 12, 5.0, (5.0, 5.0), (1, 2), terms=("Fs1", "Fs2"))
     one = FrictionSelection(terms, (0, 1), (step,)).fitted(np.array([1e-12, 0.02]))
@@ -127,7 +129,7 @@ def test_a_step_whose_terms_the_final_fit_switched_off_is_not_kept():
     assert not none.steps[0].kept and none.steps[0].note and none.chosen == "standard"
 
 
-def test_totals_of_the_friction_ladder_leave_out_joints_in_units_of_their_own() -> None:
+def test_ladder_totals_leave_out_amperes() -> None:
     """A joint in amperes of its own may have any size: no total changes with it, and that joint's own error stays."""
     case = planted.case("train", 0, noise=0.05)
     large = replace(case, target=case.target * np.array([1.0, 1.0, 1e3]))

@@ -36,7 +36,9 @@ def test_a_pipe_gets_tables_of_full_width(monkeypatch):
 
 
 @pytest.mark.parametrize("command, words", [("identify", "starts over"), ("next", "goes on from here")])
-def test_ctrl_c_says_what_the_same_command_will_do(monkeypatch, capsys, command, words):
+def test_ctrl_c_says_what_a_rerun_will_do(monkeypatch, capsys, command, words):
+    """Ctrl-C says what the same command will do."""
+
     def stop(*args, **kwargs):
         raise KeyboardInterrupt
 
@@ -46,7 +48,9 @@ def test_ctrl_c_says_what_the_same_command_will_do(monkeypatch, capsys, command,
     assert words in capsys.readouterr().err
 
 
-def test_a_second_ctrl_c_ends_as_the_first_would(monkeypatch):
+def test_second_ctrl_c_ends_as_the_first(monkeypatch):
+    """A second Ctrl-C ends as the first would."""
+
     def stop(*args, **kwargs):
         raise KeyboardInterrupt
 

@@ -47,13 +47,15 @@ def judged(unseen: Score | None, own: Score | None = None) -> Verdict:
         ([96, 5, 5], [np.nan, 5, 5], "pass", ""),  # never moves
     ],
 )
-def test_a_joint_without_a_model_is_named_and_fails_where_its_torque_matters(joints, moving, level, named):
+def test_joint_without_model_is_named(joints, moving, level, named):
+    """A joint without a model is named, and fails where its torque matters."""
     found = judged(scored(joints, moving))
     assert found.level == level
     assert named in found.reason and found.code == ("joints-unexplained" if named else "")
 
 
-def test_the_total_says_which_criterion_was_missed():
+def test_total_says_which_criterion_failed():
+    """The total says which criterion was missed."""
     found = judged(scored([11, 11, 11], total=11.0))
     assert (found.level, found.code) == ("marginal", "torque-unexplained")
     found = judged(scored([9, 9, 9], total=9.0), scored([4, 4, 4], total=4.0))
@@ -62,20 +64,23 @@ def test_the_total_says_which_criterion_was_missed():
     assert (found.level, found.code) == ("fail", "torque-unexplained")
 
 
-def test_without_unseen_motion_the_joints_of_the_fit_count():
+def test_fit_joints_count_without_unseen():
+    """Without unseen motion the joints of the fit count."""
     _, found = judge({"train": scored([4, 70, 4])}, {}, {}, {})
     assert [one.code for one in found] == ["no-unseen-motion", "joints-unexplained"]
     assert found[1].values["joints"] == ("joint 2 (70 %)",)
 
 
 @pytest.mark.parametrize("own, unseen, level", [(29, None, "marginal"), (31, None, "fail"), (31, 20, "fail")])
-def test_a_model_that_misses_its_own_motion_fails_without_unseen_motion_too(own, unseen, level):
+def test_model_missing_its_own_motion_fails(own, unseen, level):
+    """A model that misses its own motion fails without unseen motion, too."""
     other = None if unseen is None else scored([4, 4, 4], total=unseen)
     found = judged(other, scored([4, 4, 4], total=own))
     assert found.level == level and (found.code == "training-torque-unexplained") == (level == "fail")
 
 
-def test_motion_far_beyond_the_limits_is_a_warning():
+def test_motion_far_beyond_limits_is_warned():
+    """Motion far beyond the limits is a warning."""
     case, chain = planted.case("train", 0), planted.arm()
     assert verdict.beyond(case, chain) == []
     reach = float(np.abs(case.motion.q[:, 1]).max())
@@ -87,13 +92,14 @@ def test_motion_far_beyond_the_limits_is_a_warning():
 
 
 @pytest.mark.parametrize("count", [5, 6])
-def test_most_parameters_from_the_cad_stand_in_the_reason(count):
+def test_reason_says_that_most_are_from_cad(count):
+    """That most parameters are from the CAD stands in the reason."""
     rests = Resting(tuple(f"p{k}" for k in range(count)), 10, "cad")
     reason = with_prior(Verdict("marginal", "why"), rests).reason
     assert reason == "why" if count == 5 else "6 of 10 parameters" in reason
 
 
-def test_drives_below_zero_are_told_with_their_sigma() -> None:
+def test_negative_drives_are_told_with_sigma() -> None:
     """Without the prior nothing keeps friction above zero; the log is made to push joint 2 along."""
     own = planted.case("train", 0)
     robot, settings = planted.arm(), IdentificationSettings(friction="standard", prior="none")

@@ -66,7 +66,8 @@ def test_a_repeat_is_no_evidence(robot, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(("options", "said"), [("rows = 'power'", False), ("[payload.tool]\nmass = 2.0", True)])
-def test_power_is_explained_and_a_payload_that_is_never_carried_is_said(robot, tmp_path, options, said):
+def test_uncarried_payload_is_said(robot, tmp_path, options, said):
+    """Power is explained, and a payload that is never carried is said."""
     train, other = planted.write(tmp_path, "train.npz", 0), planted.write(tmp_path, "other.npz", 1)
     (tmp_path / "options.toml").write_text(options)
     chosen = ("--options", tmp_path / "options.toml", "--friction", "standard", "--out", tmp_path / "out")
@@ -76,7 +77,8 @@ def test_power_is_explained_and_a_payload_that_is_never_carried_is_said(robot, t
     assert ("payload-never" in {one["code"] for one in found["noticed"]}) is said
 
 
-def test_the_calibrated_robots_folder_serves_and_the_nominal_chooses_columns(tmp_path):
+def test_calibrated_folder_serves(tmp_path):
+    """The calibrated robot's folder serves, and the nominal one chooses columns."""
     from calib.robot import description
 
     nominal = planted.arm()
@@ -99,7 +101,7 @@ def test_the_calibrated_robots_folder_serves_and_the_nominal_chooses_columns(tmp
         (lambda t, q, tau: (t, 0 * q + q[0], tau), "no joint moves"),
     ],
 )
-def test_input_that_cannot_be_is_refused_and_nothing_written(robot, tmp_path, capsys, spoil, said):
+def test_impossible_input_writes_nothing(robot, tmp_path, capsys, spoil, said):
     """What a reader refuses: tests/data/recordings."""
     path, good = tmp_path / "bad.npz", planted.series(0)
     np.savez(path, **dict(zip(("t", "q", "tau"), spoil(good["t"], good["q"], good["tau"]))))
@@ -108,7 +110,8 @@ def test_input_that_cannot_be_is_refused_and_nothing_written(robot, tmp_path, ca
     assert not (tmp_path / "out").exists() and not list(tmp_path.glob(".out*"))
 
 
-def test_reversed_torques_are_refused_and_one_reversed_joint_fails(robot, tmp_path, capsys):
+def test_reversed_torques_are_refused(robot, tmp_path, capsys):
+    """Reversed torques are refused, and one reversed joint fails."""
     good = planted.series(0)
     every, one = tmp_path / "reversed.npz", tmp_path / "one.npz"
     np.savez(every, t=good["t"], q=good["q"], tau=-good["tau"])
@@ -119,7 +122,8 @@ def test_reversed_torques_are_refused_and_one_reversed_joint_fails(robot, tmp_pa
     assert "friction of joint 3 adds energy" in capsys.readouterr().out
 
 
-def test_columns_in_different_units_are_pointed_at(robot, tmp_path, capsys):
+def test_unlike_units_are_pointed_at(robot, tmp_path, capsys):
+    """Columns in different units are pointed at."""
     good = planted.series(0)
     path = tmp_path / "mixed.csv"
     table = np.column_stack([good["t"], np.degrees(good["q"][:, :1]), good["q"][:, 1:], good["tau"]])
@@ -148,7 +152,8 @@ def test_columns_in_different_units_are_pointed_at(robot, tmp_path, capsys):
         ("not toml", "is not a TOML file"),
     ],
 )
-def test_options_are_held_against_what_exists(robot, tmp_path, capsys, text, said):
+def test_options_are_checked_for_existence(robot, tmp_path, capsys, text, said):
+    """Options are held against what exists."""
     train, identify_options = planted.write(tmp_path, "train.npz", 0), tmp_path / "options.toml"
     identify_options.write_text(text)
     code = run(robot, train, "--options", identify_options, "--out", tmp_path / "out")
@@ -156,7 +161,8 @@ def test_options_are_held_against_what_exists(robot, tmp_path, capsys, text, sai
     assert not (tmp_path / "out").exists()
 
 
-def test_a_payload_of_unknown_centre_on_unseen_motion_alone_is_refused(robot, tmp_path, capsys):
+def test_unseen_payload_needs_a_centre(robot, tmp_path, capsys):
+    """A payload of unknown centre on unseen motion alone is refused."""
     train, unseen = planted.write(tmp_path, "train.npz", 0), planted.write(tmp_path, "other.npz", 1)
     identify_options = tmp_path / "options.toml"
     identify_options.write_text('[payload.tool]\nmass = 2.0\n[files."other.npz"]\npayload = ["tool"]')
@@ -174,7 +180,8 @@ def test_other_folders_are_not_overwritten(robot, tmp_path, capsys):
     assert "is listed twice" in capsys.readouterr().err
 
 
-def test_every_key_of_the_documented_options_is_read(tmp_path):
+def test_documented_option_keys_are_read(tmp_path):
+    """Every key of the documented options is read."""
     from calib.identification import identify_options
 
     text = identify_options.__doc__.split("from 1::\n\n", 1)[1]
@@ -186,7 +193,8 @@ def test_every_key_of_the_documented_options_is_read(tmp_path):
     assert found.settings.couplings[0].joints == (4, 5)
 
 
-def test_the_model_comes_back_from_its_folder_and_predicts_the_same(robot, tmp_path):
+def test_model_reads_back_and_predicts_alike(robot, tmp_path):
+    """The model comes back from its folder and predicts the same."""
     from calib.identification.model_file import read_dynamics
     from calib.identification.prediction import predict
 
@@ -204,7 +212,8 @@ def test_the_model_comes_back_from_its_folder_and_predicts_the_same(robot, tmp_p
 
 
 @pytest.mark.parametrize("kind", ["mcap", pytest.param("sqlite3", marks=pytest.mark.slow)])
-def test_a_bag_of_two_publishers_tells_what_the_archive_tells(robot, tmp_path, kind):
+def test_two_publisher_bag_equals_archive(robot, tmp_path, kind):
+    """A bag of two publishers tells what the archive tells."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 

@@ -12,7 +12,7 @@ from calib.procedure.dynamic_stage.plain import RANK, PlainReferences, truncated
 from calib.procedure.findings import level_of
 
 
-def test_plain_least_squares_is_truncated_at_the_rank_of_the_data():
+def test_plain_ols_is_truncated_at_rank():
     """A column that repeats another changes no prediction, and neither does one that nearly does."""
     rng = np.random.default_rng(0)
     w, x = rng.normal(size=(400, 3)), np.array([1.0, -2.0, 0.5])
@@ -25,7 +25,8 @@ def test_plain_least_squares_is_truncated_at_the_rank_of_the_data():
     assert abs(shared) < 0.05 < 0.5 < abs(torn), "the noise does not decide how twins share"
 
 
-def test_plain_least_squares_weighs_joints_by_their_residuals():
+def test_plain_ols_weighs_joints():
+    """Plain least squares weighs joints by their residuals."""
     rng = np.random.default_rng(1)
     noise, joint = np.repeat([0.01, 5.0], 300), np.repeat([0, 1], 300)
     w = rng.normal(size=(600, 4))
@@ -34,17 +35,19 @@ def test_plain_least_squares_weighs_joints_by_their_residuals():
 
 
 @pytest.mark.parametrize(("delivered", "level"), [(1.08, None), (1.15, "marginal")])
-def test_a_model_that_plain_least_squares_beats_is_no_pass(delivered, level):
+def test_model_worse_than_plain_ols_fails(delivered, level):
+    """A model that plain least squares beats is no pass."""
     found = worse_than_plain({"a": PlainReferences(0.9, 1.0, 50.0), "b": PlainReferences(delivered, 1.0, np.nan)})
     assert [level_of(one) for one in found] == ([level] if level else [])
     assert all(one.values["file"] == "b" for one in found)
 
 
-def test_without_plain_values_nothing_is_compared():
+def test_no_comparison_without_plain_values():
+    """Without plain values nothing is compared."""
     assert worse_than_plain({"a": PlainReferences(5.0, np.nan, np.nan)}) == []
 
 
-def test_an_identification_prints_and_stores_its_references(robot, tmp_path):
+def test_identification_stores_references(robot, tmp_path):
     """Of rich motion with simple friction plain least squares is as good; the nominal masses lack friction."""
     train, other = planted.write(tmp_path, "train.npz", 0), planted.write(tmp_path, "other.npz", 1)
     model = calib.identify_dynamics(robot, train, validate=other)

@@ -110,7 +110,8 @@ payload = ["load"]
 
 
 @pytest.mark.slow
-def test_ur10e_currents_become_torques_and_friction_pays(data, tmp_path):
+def test_ur10e_currents_become_torques(data, tmp_path):
+    """The UR10e's currents become torques, and friction pays."""
     folder = data / "ur10e_innopolis"
     unseen = [folder / f"ur-20_02_19_14harm50sec{end}.npz" for end in ("", "Load")]
     train = folder / "ur-20_02_10-30sec_12harm.npz"
@@ -146,7 +147,7 @@ def gains(folder: Path, pair: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.slow
-def test_ur10e_two_pairs_of_runs_tell_the_same_gains(data):
+def test_ur10e_run_pairs_tell_the_same_gains(data):
     """Measured, of all joints: 10.8 12.3 10.0 10.4 10.2 10.3 and 11.8 12.6 10.1 10.4 10.0 9.5 N m/A.
 
     The load of the second pair is not stated and taken as the first's, which these gains confirm within 3 %.
@@ -157,7 +158,7 @@ def test_ur10e_two_pairs_of_runs_tell_the_same_gains(data):
 
 
 @pytest.mark.slow
-def test_ur10e_gains_of_one_pair_serve_the_other(data, tmp_path):
+def test_ur10e_gains_serve_another_pair(data, tmp_path):
     """No run of the pair that is predicted told anything: neither gains nor the load."""
     folder = data / "ur10e_innopolis"
     options = UR10E
@@ -171,7 +172,7 @@ def test_ur10e_gains_of_one_pair_serve_the_other(data, tmp_path):
 
 
 @pytest.mark.slow
-def test_ur10e_currents_alone_tell_what_they_can(data, tmp_path):
+def test_ur10e_currents_tell_what_they_can(data, tmp_path):
     """Measured 0.96 ± 0.14, 0.81 ± 0.02, 0.91 ± 0.15 and 0.84 ± 0.15 of joint 2's; of the last joint nothing."""
     folder = data / "ur10e_innopolis"
     train, unseen = (folder / f"ur-20_02_{name}harm.npz" for name in ("05-20sec_8", "10-30sec_12"))
@@ -203,7 +204,7 @@ band = 20.0
 
 
 @pytest.mark.slow
-def test_tx40_its_coupled_wrist_and_coulomb_friction(data, tmp_path):
+def test_tx40_wrist_and_coulomb_friction(data, tmp_path):
     """Friction at half the speed and more within 2.5 % of the reference; Fc itself is where a line meets standstill.
 
     It depends on which speeds are cut (joint 1: -7 % with none, as here; -0.4 at 1 % of the peak speed, +6 at 3 %), as
@@ -230,7 +231,8 @@ def test_tx40_its_coupled_wrist_and_coulomb_friction(data, tmp_path):
 
 
 @pytest.mark.slow
-def test_tx40_richer_friction_pays_on_other_motion(data, tmp_path):
+def test_tx40_richer_friction_pays(data, tmp_path):
+    """The TX40's richer friction pays on other motion."""
     folder = data / "staubli_tx40"
     log = folder / "tx40_first_5p4s.npz"
     options = '[[coupling]]\njoints = [5, 6]\nlabel = "6"'
@@ -242,7 +244,8 @@ def test_tx40_richer_friction_pays_on_other_motion(data, tmp_path):
 
 
 @pytest.mark.slow
-def test_lwr_with_one_sine_says_what_it_cannot_tell(data, tmp_path):
+def test_lwr_one_sine_says_its_limits(data, tmp_path):
+    """The LWR with one sine says what it cannot tell."""
     folder = data / "kuka_lwr4plus_iit"
     log = folder / "measurements_1.npz"
     found = identify(tmp_path / "out", folder / "model.urdf", f"{log}@2.5:18", "--validate", f"{log}@18:")
@@ -259,7 +262,7 @@ def test_lwr_with_one_sine_says_what_it_cannot_tell(data, tmp_path):
 
 
 @pytest.mark.slow
-def test_lwr_full_parameters_hold_where_it_has_not_been(data, tmp_path):
+def test_lwr_parameters_hold_elsewhere(data, tmp_path):
     """Half of the one closed curve learnt, the other half predicted: plain least squares is worse than the CAD."""
     from calib.dynamics.bodies import standard_parameters
     from calib.identification import prediction
@@ -289,7 +292,7 @@ def test_lwr_full_parameters_hold_where_it_has_not_been(data, tmp_path):
 
 
 @pytest.mark.slow
-def test_kr300_needs_the_prior_on_other_motion(data, tmp_path):
+def test_kr300_needs_prior_on_other_motion(data, tmp_path):
     """Measured in motion: A → B 12.4 % drawn, 18.5 bare with standard friction; B → A 13.4 and 31.5.
 
     Joint 2 moves over ranges that barely overlap. Of all samples, a quarter at rest, 19.0 and 21.7, 20.2 and 31.6 %;
@@ -305,7 +308,7 @@ def test_kr300_needs_the_prior_on_other_motion(data, tmp_path):
 
 
 @pytest.mark.slow
-def test_tiago_prismatic_torso_and_signed_gains(data, tmp_path):
+def test_tiago_torso_and_signed_gains(data, tmp_path):
     """Measured 17.1 %: standing rows count as any others here, for counted once they gave 22.7."""
     folder = data / "tiago_laas"
     log = folder / "dynamic.npz"
@@ -330,7 +333,8 @@ LOGS = {
 
 
 @pytest.mark.parametrize("log", [pytest.param(one, marks=[pytest.mark.slow] * ("tx40" not in one)) for one in LOGS])
-def test_no_sign_and_no_order_of_a_sound_recording_is_called_wrong(data, log):
+def test_sound_recordings_are_not_accused(data, log):
+    """No sign and no order of a sound recording is called wrong."""
     robot, (start, middle, end) = (data / log).parent / "model.urdf", LOGS[log]
     for part in ((start, end), (start, middle), (middle, end)):
         (case,) = gather(robot, [f"{data / log}@{part[0]}:{part[1]}"]).cases
@@ -348,7 +352,8 @@ def panda(data) -> tuple[Chain, Case]:
 
 
 @pytest.mark.parametrize(("joint", "way"), [(1, 1.0), (2, 1.0), (2, -1.0), (4, -1.0)])
-def test_a_joint_of_a_panda_that_counts_from_the_one_before_it_is_named(panda, joint, way):
+def test_panda_coupled_joint_is_named(panda, joint, way):
+    """A joint of a Panda that counts from the one before it is named."""
     robot, case = panda
     matrix = coupling(7, joint, joint - 1, -way)
     motion = replace(case.motion, **{name: getattr(case.motion, name) @ matrix.T for name in "qva"})

@@ -30,7 +30,8 @@ def said(capsys, *arguments: object) -> str:
     return " ".join((out + err).split())
 
 
-def test_each_fault_is_named_with_its_file_and_joint(robot, tmp_path, capsys):
+def test_faults_are_named_with_their_file(robot, tmp_path, capsys):
+    """Each fault is named with its file and joint."""
     plain = planted.write(tmp_path, "plain.npz", 0)
     loaded = planted.write(tmp_path, "loaded.npz", 1, tau=planted.series(1, payload=True)["tau"])
     words = said(capsys, robot, plain, loaded, "--validate", spoiled(tmp_path), "--out", tmp_path / "out", "-v")
@@ -40,7 +41,8 @@ def test_each_fault_is_named_with_its_file_and_joint(robot, tmp_path, capsys):
     assert "loaded.npz: an unstated payload of 2" in words
 
 
-def test_sound_recordings_with_a_stated_payload_are_accused_of_nothing(robot, tmp_path, capsys):
+def test_sound_payload_recordings_are_clear(robot, tmp_path, capsys):
+    """Sound recordings with a stated payload are accused of nothing."""
     plain = planted.write(tmp_path, "plain.npz", 0)
     loaded = planted.write(tmp_path, "loaded.npz", 1, tau=planted.series(1, payload=True)["tau"])
     options = tmp_path / "options.toml"
@@ -51,7 +53,8 @@ def test_sound_recordings_with_a_stated_payload_are_accused_of_nothing(robot, tm
     assert not any(code in codes for code in CODES)
 
 
-def test_a_joint_that_stands_is_no_fault_and_no_obstacle(robot, tmp_path, capsys):
+def test_standing_joint_is_no_fault(robot, tmp_path, capsys):
+    """A joint that stands is no fault and no obstacle."""
     t, q, v, a = (np.array(series) for series in planted.motion(0))
     q[:, 0], v[:, 0], a[:, 0] = 0.3, 0.0, 0.0
     noise = 0.2 * np.random.default_rng(0).normal(size=q.shape)

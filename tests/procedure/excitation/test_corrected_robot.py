@@ -29,7 +29,8 @@ def folder(robot: CalibratedChain, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_an_excitation_has_the_rigid_geometry(robot: CalibratedChain, folder: Path) -> None:
+def test_excitation_has_rigid_geometry(robot: CalibratedChain, folder: Path) -> None:
+    """An excitation has the rigid geometry."""
     settings = ExcitationSettings(period=5.0)
     one, two, three = (read_inputs(each, settings) for each in (robot, folder, folder / "robot.toml"))
     rng = np.random.default_rng(1)

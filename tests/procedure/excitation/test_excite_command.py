@@ -55,7 +55,8 @@ QUICK = ("--starts", 1, "--evaluations", 60, "--period", 16, "--harmonics", 4, "
 SHORT = ExcitationSettings(starts=1, evaluations=45, period=16.0, harmonics=4, rate=100.0, samples=120)
 
 
-def test_the_motion_keeps_its_limits_and_is_written_for_a_controller(cell, calib):
+def test_motion_is_written_within_its_limits(cell, calib):
+    """The motion keeps its limits, and is written for a controller."""
     Path("limits.toml").write_text(LIMITS)
     stands = "-0.8,-1.0,-1.0,-1.2,0.2,-1.5,0.3"
     played = ("--start", stands, "--repeat", 2, "--slower", 3, "--plots")
@@ -135,7 +136,7 @@ def test_motions_before_count(earlier, tmp_path):
     assert 0.9 < np.median(ratio) < 1.02
 
 
-def test_a_motion_to_validate_on_stays_within_the_earlier_one(earlier):
+def test_validation_motion_stays_in_earlier(earlier):
     """And is another motion: joint by joint its positions are not those of the first."""
     few = replace(SHORT, period=12.0, evaluations=10, within=str(earlier), seed=5, outlook=False)
     found = design.excite("lwr4plus", few)
@@ -149,7 +150,7 @@ def test_a_motion_to_validate_on_stays_within_the_earlier_one(earlier):
     assert max(abs(np.corrcoef(a, b)[0, 1]) for a, b in zip(known[0].T, motion.q.T)) < 0.9
 
 
-def test_a_calibrated_arm_is_excited_for_the_columns_that_will_be_identified():
+def test_tilted_arm_excites_nominal_columns():
     """Its tilted axes raise the exact rank by columns that no motion tells from others."""
     nominal = load("tx40")
     values = nominal.values + 5e-4 * np.random.default_rng(0).standard_normal(len(nominal.values))
@@ -160,7 +161,8 @@ def test_a_calibrated_arm_is_excited_for_the_columns_that_will_be_identified():
 
 
 @pytest.mark.slow
-def test_a_held_joint_stays_and_its_columns_are_said(cell, calib):
+def test_held_joint_stays_and_is_said(cell, calib):
+    """A held joint stays, and its columns are said."""
     code, out, err = calib("excite", "lwr4plus", "--lock", "joint4=0.5", "--out", "e", *QUICK)
     assert code == 0, err
     metrics = json.loads(Path("e/metrics.json").read_text())
@@ -173,7 +175,8 @@ def test_a_held_joint_stays_and_its_columns_are_said(cell, calib):
     assert (rows["q"][:, 3] == 0.5).all() and (rows["v"][:, 3] == 0.0).all()
 
 
-def test_the_columns_told_with_a_joint_held_are_all_there_are():
+def test_held_joint_columns_have_full_rank():
+    """The columns told with a joint held are all there are."""
     chain = CHAIN
     dynamics = read_model(chain, None, "Fv Fc off", read_motion_limits(None, chain))
     rng = np.random.default_rng(3)
@@ -186,7 +189,8 @@ def test_the_columns_told_with_a_joint_held_are_all_there_are():
     assert np.linalg.cond(scaled[:, held.columns]) < 200
 
 
-def test_a_motion_is_recalled_from_a_log_and_read_by_identify(earlier, tmp_path, cell, calib):
+def test_motion_in_a_log_is_read_by_identify(earlier, tmp_path, cell, calib):
+    """A motion is recalled from a log, and read by identify."""
     reference = coefficients.read(earlier)
     times, sigma = np.arange(4 * 1600) / 100, 0.02
     q, rng = reference.orders(times)[0], np.random.default_rng(0)
@@ -269,7 +273,8 @@ def test_ctrl_c_keeps_the_best_motion_so_far(cell, calib, monkeypatch):
 
 
 @pytest.mark.slow
-def test_an_aim_in_place_of_condition_numbers(designed):
+def test_aim_replaces_condition_numbers(designed):
+    """An aim takes the place of condition numbers."""
     told = design.excite("lwr4plus", replace(SHORT, goals=("logdet",), outlook=False))
     assert told.condition.raw > designed.condition.raw and told.found.merit < 0.0
 
@@ -332,7 +337,8 @@ def test_ctrl_c_in_worker_processes(tmp_path, whom):
         ("", ("--model", "nowhere"), "folder of an identification"),
     ],
 )
-def test_bad_input_is_refused_with_exit_code_2(cell, calib, extra, options, words):
+def test_bad_input_exits_with_code_2(cell, calib, extra, options, words):
+    """Bad input is refused with exit code 2."""
     Path("limits.toml").write_text(extra)
     quick = (*QUICK[:2], "--evaluations", 12, *QUICK[4:])
     code, _, err = calib("excite", "lwr4plus", "--limits", "limits.toml", "--out", "e", *quick, *options)
@@ -348,7 +354,7 @@ def test_bad_input_is_refused_with_exit_code_2(cell, calib, extra, options, word
         ("", {"hard": ("wrist=0.9",)}, "hard goal wrist=0.9 was not reached"),
     ],
 )
-def test_a_search_without_a_result_names_what_was_in_the_way(tmp_path, extra, changed, words):
+def test_failed_search_names_the_obstacle(tmp_path, extra, changed, words):
     """The command says the same: see the workspace limit above."""
     limits, few = tmp_path / "limits.toml", replace(SHORT, evaluations=12, samples=40, **changed)
     limits.write_text(extra)
@@ -356,7 +362,8 @@ def test_a_search_without_a_result_names_what_was_in_the_way(tmp_path, extra, ch
         design.excite("lwr4plus", few, limits=limits)
 
 
-def test_an_identified_model_predicts_torques_with_their_uncertainty(tmp_path):
+def test_identified_model_predicts_sigmas(tmp_path):
+    """An identified model predicts torques with their uncertainty."""
     write_model(tmp_path / "m")
     names, known = base_of_lwr().names, identified()
     write_covariance(tmp_path / "m" / "covariance.csv", names, 0.01 * np.eye(len(names)))
@@ -383,7 +390,8 @@ def test_named_points_move_with_their_links():
     assert np.allclose(points(q)[:, 0], forward(chain, q)[:, :3, 3])
 
 
-def test_collision_distances_are_kept_with_a_slope(tmp_path):
+def test_collision_distances_have_a_slope(tmp_path):
+    """Collision distances are kept with a slope."""
     (tmp_path / "l.toml").write_text("[collision]\nradius = 0.05\nfloor = -0.3\n")
     chain = CHAIN
     limits = read_motion_limits(tmp_path / "l.toml", chain)
@@ -403,7 +411,7 @@ PAYLOAD = {"rows": "both", "payload": {"load": {"mass": 3.28, "com": [0.0, 0.0, 
 
 
 @pytest.mark.slow
-def test_the_design_is_for_the_model_that_will_be_identified():
+def test_design_is_for_the_model_to_identify():
     """Both torque rows, runs without and with the payload: 102 columns, and both loads keep the torque limits."""
     options = parse_options(PAYLOAD).settings
     goals = ("raw=300", "joint6=0.02")
@@ -421,12 +429,13 @@ def test_the_design_is_for_the_model_that_will_be_identified():
 
 
 @pytest.mark.parametrize("solver", ["mma", "ccsaq", "auglag"])
-def test_other_solvers_end_within_the_limits_too(solver):
+def test_other_solvers_keep_the_limits_too(solver):
+    """Other solvers end within the limits, too."""
     found = design.excite("ur10e", replace(SHORT, solver=solver, evaluations=10, samples=60, outlook=False))
     assert found.proof.feasible and np.isfinite(found.condition.raw)
 
 
-def test_stated_noise_weighs_rows_and_predicts():
+def test_stated_noise_weighs_rows():
     """The default share of the torque limits, stated by joint, predicts the same; --noise beside it is refused."""
     limits = read_inputs("lwr4plus", SHORT).limits.torque
     noise = {f"q{j + 1}": 0.01 * x for j, x in enumerate(limits)}
@@ -442,7 +451,7 @@ def test_stated_noise_weighs_rows_and_predicts():
 
 
 @pytest.mark.slow
-def test_designs_for_predicted_sigmas_predict_smaller_ones():
+def test_designs_lower_the_predicted_sigma():
     """Of torques on the typical task, and of the parameters relative to their values."""
     found = {goal: design.excite("lwr4plus", replace(SHORT, goals=goal)) for goal in ((), ("torque",), ("parameters",))}
     torque = {goal: one.outlook.own.torque_sigma_share for goal, one in found.items()}
@@ -452,7 +461,7 @@ def test_designs_for_predicted_sigmas_predict_smaller_ones():
         design.excite("ur10e", replace(SHORT, goals=("parameters",)))
 
 
-def test_an_identification_of_another_arm_is_refused(tmp_path):
+def test_identification_of_other_arm_fails(tmp_path):
     """Of as many joints, for motions to excite and to plan alike; no search begins."""
     write_model(tmp_path)
     way = np.linspace(np.zeros(7), np.full(7, 0.1), 2)
@@ -482,7 +491,7 @@ def test_a_front_serves_the_goals():
 
 
 @pytest.mark.slow
-def test_a_torque_goal_works_before_friction_is_known():
+def test_torque_goal_works_without_friction():
     """Typical friction stands in for what nobody knows yet, so that condition numbers do not pay for a goal in vain."""
     settings = replace(SHORT, starts=2, evaluations=300, outlook=False)
     plain = design.excite("lwr4plus", settings)
@@ -504,12 +513,13 @@ def test_a_torque_goal_works_before_friction_is_known():
         ({"rows": "both", "coupling": [{"joints": [5, 6]}]}, {}, 'label = "5_6"'),
     ],
 )
-def test_models_that_no_motion_can_be_designed_for(options, settings, words):
+def test_models_without_possible_motion(options, settings, words):
+    """Models that no motion can be designed for are refused."""
     with pytest.raises(UsageError, match=re.escape(words)):
         design.excite("lwr4plus", replace(SHORT, **settings), options=parse_options(options).settings)
 
 
-def test_a_payload_that_the_limits_cannot_carry_is_refused():
+def test_too_heavy_payload_is_refused():
     """60 kg on a TX40, rated 2 kg: joint, torque, limit and posture are said; 5 kg are designed for."""
     heavy, light = (parse_options({"payload": {"tool": {"mass": mass}}}).settings for mass in (60.0, 5.0))
     with pytest.raises(UsageError, match=r"in 7\d% of the postures: at joint 2 .* limit 131.8 N m .* in the posture"):

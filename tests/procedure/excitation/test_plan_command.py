@@ -70,7 +70,8 @@ def test_an_identified_model_is_planned_with(room, capsys):
     assert not (room / "out" / "approach.csv").exists()
 
 
-def test_model_and_stated_drives_plan_the_same_motion(room):
+def test_model_and_stated_drives_plan_alike(room):
+    """Model and stated drives plan the same motion."""
     one = planning.plan("lwr4plus", room / "way.csv", model=room / "model")
     two = planning.plan("lwr4plus", room / "way.csv", drives=room / "drives.toml")
     assert one.track.duration == two.track.duration and "no covariance" in one.notes[1]
@@ -149,7 +150,8 @@ def test_waypoints_of_the_tool(room, capsys):
         (["--out", "way.csv"], "is a file"),
     ],
 )
-def test_limits_waypoints_and_options_that_leave_no_motion(room, capsys, given, message):
+def test_impossible_plan_inputs_are_refused(room, capsys, given, message):
+    """Limits, waypoints and options that leave no motion are refused."""
     Path("limits.toml").write_text(given if isinstance(given, str) else "")
     if isinstance(given, np.ndarray):
         write_waypoints(given)
@@ -173,7 +175,7 @@ def test_a_damaged_model_is_refused(room, capsys):
     assert "no identified model" in capsys.readouterr().err
 
 
-def test_an_uncertain_model_keeps_torque_free(room, capsys):
+def test_uncertain_model_keeps_torque_free(room, capsys):
     """Only Ia2 is uncertain, so sigma is its own times the largest acceleration of joint 2."""
     files.write_table(
         room / "model" / "covariance.csv", ("name", "Ia2", "ZZ3R"), [("Ia2", 0.04, 0.0), ("ZZ3R", 0.0, 0.0)]
@@ -202,7 +204,8 @@ def test_a_payload_on_board_takes_longer(room):
     assert free < loaded
 
 
-def test_waypoints_that_leave_a_joint_out_plan_no_shorter_arm(room, capsys):
+def test_waypoints_do_not_shorten_the_arm(room, capsys):
+    """Waypoints that leave a joint out plan no shorter arm."""
     from calib.robot.formats.urdf_write import write_new
 
     Path("arm.urdf").write_text(write_new(CHAIN))
@@ -223,7 +226,8 @@ def test_waypoints_that_leave_a_joint_out_plan_no_shorter_arm(room, capsys):
         ({"effort": 0.0}, "no limit for the acceleration of A4 (effort 0 is not a limit)"),
     ],
 )
-def test_a_robot_that_cannot_be_is_not_planned_with(room, capsys, change, message):
+def test_impossible_robot_gets_no_plan(room, capsys, change, message):
+    """No motion is planned with a robot that cannot exist."""
     joints, bodies = list(CHAIN.joints), np.array(CHAIN.inertias)
     joints[3] = replace(joints[3], name="A4", **{key: value for key, value in change.items() if key != "M"})
     bodies[3, 9] = change.get("M", bodies[3, 9])
@@ -238,7 +242,7 @@ def test_a_robot_that_cannot_be_is_not_planned_with(room, capsys, change, messag
 
 
 @pytest.mark.parametrize("stated", ["", '[velocity]\nall = "30 deg/s"\n', "[acceleration]\nq1 = 5.0\n"])
-def test_no_plan_without_a_limit_of_acceleration(room, capsys, stated):
+def test_plan_needs_acceleration_limits(room, capsys, stated):
     """Masses are not known of a UR10e, so nothing but the limits file can say how fast its joints may gather speed."""
     write_waypoints([[0, -1.6, 1.6, -1.6, -1.6, 0], [0.7, -1.2, 1.4, -1.7, -1.6, 0.3]], header="q1,q2,q3,q4,q5,q6")
     Path("limits.toml").write_text(stated)
@@ -257,14 +261,16 @@ def test_no_plan_without_a_limit_of_acceleration(room, capsys, stated):
     assert np.abs(read_setpoints(Path("out/motion.csv"))["a"]).max() <= 5.0 * (1 + 1e-9)
 
 
-def test_a_motion_beyond_its_bounds_is_not_written(room):
+def test_motion_beyond_bounds_is_not_written(room):
+    """A motion beyond its bounds is not written."""
     planned = planning.plan("lwr4plus", room / "way.csv")
     with pytest.raises(CalibError, match=r"the velocity of joint\d reaches .*, so the motion is not written"):
         motion_folder.write_plan(replace(planned, track=replace(planned.track, v=2 * planned.track.v)), room / "out")
     assert not (room / "out").exists()
 
 
-def test_torque_limits_that_no_robot_has_limit_no_acceleration(room):
+def test_absurd_torque_limits_limit_nothing(room):
+    """Torque limits that no robot has limit no acceleration."""
     joints = tuple(replace(joint, effort=1e4) for joint in CHAIN.joints)
     with pytest.raises(CalibError, match=r"the acceleration of joint\d reaches \d+ in this motion, above 3000"):
         planning.plan(CalibratedChain(replace(CHAIN, joints=joints)), room / "way.csv")

@@ -19,7 +19,8 @@ PHASE = 2 * np.pi * T[:, None] / T[-1] * [1, 2, 3]
 LOOP = Setpoints(RATE, np.sin(PHASE), np.cos(PHASE) * [np.pi, 2 * np.pi, 3 * np.pi], np.zeros((PERIOD + 1, 3)))
 
 
-def test_an_approach_keeps_its_limits_and_reaches_one_of_them():
+def test_approach_reaches_one_of_its_limits():
+    """An approach keeps its limits and reaches one of them."""
     found = straight_approach(np.array([0.3, -1.0, 0.5]), np.array([-1.2, 0.4, 0.6]), V, A, J, RATE)
     np.testing.assert_allclose(found.q[[0, -1]], [[0.3, -1.0, 0.5], [-1.2, 0.4, 0.6]], atol=1e-9)
     for values, bound in ((found.v, V), (found.a, A), (np.diff(found.a, axis=0) * RATE, J)):
@@ -94,7 +95,8 @@ def recorded(sigma: float, periods: int = 5, seed: int = 0) -> tuple[np.ndarray,
     return log + sigma * rng.normal(size=log.shape), 333 + len(start)
 
 
-def test_a_motion_is_found_in_a_log_and_cut_to_whole_periods():
+def test_logged_motion_is_cut_to_periods():
+    """A motion is found in a log, and cut to whole periods."""
     log, start = recorded(0.01)
     found = find_periods(log, LOOP.q[:-1])
     assert (found.start, found.periods, found.period) == (start, 5, PERIOD)
@@ -102,7 +104,8 @@ def test_a_motion_is_found_in_a_log_and_cut_to_whole_periods():
     assert find_periods(log, LOOP.q[:-1], skip=1).start == start + PERIOD
 
 
-def test_the_variance_over_periods_is_that_of_the_noise_and_the_mean_is_better():
+def test_period_variance_is_that_of_noise():
+    """The variance over periods is that of the noise, and the mean is better."""
     sigma = np.array([0.01, 0.02, 0.03])
     log, start = recorded(0.0, periods=12)
     noisy = log + sigma * np.random.default_rng(1).normal(size=log.shape)

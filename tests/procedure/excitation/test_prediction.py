@@ -53,7 +53,7 @@ def outcome(designed: design.Designed) -> identify.IdentificationOutcome:
     return identify.run(inputs.gather("lwr4plus", [log], options=options))
 
 
-def test_the_geometrys_part_is_that_of_an_identification(designed, outcome):
+def test_geometry_part_is_of_identification(designed, outcome):
     """Of independent errors of all elements: sigma_geometry as `propagate` finds it from the log."""
     chain, given = outcome.inputs.chain, designed.inputs
     sizes = np.where(np.array(chain.units) == "m", 2e-4, 1e-3)
@@ -68,7 +68,8 @@ def test_the_geometrys_part_is_that_of_an_identification(designed, outcome):
     assert len(ratios) > 40 and 0.9 < np.median(ratios) < 1.1 and np.quantile(np.abs(np.log(ratios)), 0.9) < 0.3
 
 
-def test_sigmas_stated_are_those_predicted_within_a_factor(motion, outcome):
+def test_stated_sigmas_are_near_predicted(motion, outcome):
+    """The sigmas stated are those predicted, within a factor."""
     with (motion / prediction.NAME).open() as file:
         promised = {line.split(",")[0]: float(line.split(",")[3]) for line in file.readlines()[1:]}
     found = outcome.found
@@ -79,7 +80,8 @@ def test_sigmas_stated_are_those_predicted_within_a_factor(motion, outcome):
     assert f"({len(found.names)} parameters): median {np.median(ratios):.2g}" in said and "1 % assumed" in said
 
 
-def test_longer_motion_tells_more_and_the_figures_are_in_the_folder(designed, motion):
+def test_longer_motion_tells_more(designed, motion):
+    """Longer motion tells more, and the figures are in the folder."""
     outlook = designed.outlook
     shares = {round(one.seconds): one.torque_sigma_share for one in outlook.by_period}
     assert set(shares) >= {10, 20, 40} and shares[20] == pytest.approx(shares[10] / np.sqrt(2))
@@ -96,7 +98,8 @@ def test_sigmas_go_with_the_noise(designed):
     assert more.by_period == ()
 
 
-def test_a_folder_without_a_prediction_is_refused(motion, outcome, tmp_path):
+def test_missing_prediction_is_refused(motion, outcome, tmp_path):
+    """A folder without a prediction is refused."""
     with pytest.raises(UsageError, match=r"has no prediction\.csv"):
         prediction.check_folder(tmp_path)
     fitted = SimpleNamespace(estimate=SimpleNamespace(sigma=np.ones(2)))

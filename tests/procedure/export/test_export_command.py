@@ -42,7 +42,8 @@ def fitted(cell, fitted_folder) -> Path:
     return Path("done")
 
 
-def test_the_source_keeps_everything_but_its_joint_origins(cell, calib, fitted):
+def test_source_changes_in_origins_alone(cell, calib, fitted):
+    """The source keeps everything but its joint origins."""
     code, out, err = calib("export", fitted, "--urdf", "source.urdf", "--out", "new.urdf")
     assert code == 0, err
     assert "base link, flange and all else are unchanged" in out
@@ -58,7 +59,8 @@ def test_the_source_keeps_everything_but_its_joint_origins(cell, calib, fitted):
     assert Path("new.urdf").read_text() == before
 
 
-def test_pinocchio_reads_the_exported_urdf_as_the_calibrated_arm(cell, calib, fitted):
+def test_pinocchio_reads_the_calibrated_arm(cell, calib, fitted):
+    """Pinocchio reads the exported URDF as the calibrated arm."""
     pin = pytest.importorskip("pinocchio")
     assert calib("export", fitted, "--urdf", "source.urdf", "--out", "new.urdf")[0] == 0
     chain, model = load(fitted), pin.buildModelFromUrdf("new.urdf")
@@ -68,7 +70,7 @@ def test_pinocchio_reads_the_exported_urdf_as_the_calibrated_arm(cell, calib, fi
         assert np.abs(data.oMf[tip].homogeneous - forward(chain, q[None])[0]).max() < 1e-9
 
 
-def test_an_arm_fitted_from_a_table_goes_into_a_urdf_of_the_same_arm(cell, calib, fitted):
+def test_table_fit_goes_into_a_urdf(cell, calib, fitted):
     """Also after a second fit that started from the first one's folder: the first nominal is remembered."""
     file = cell.write("b.csv", cell.measure(60, 3))
     assert calib("fit", "ur5", "a.csv", "--model", "geometry", "--out", "table")[0] == 0
@@ -99,7 +101,8 @@ def test_offsets_are_what_a_controller_adds(cell, calib, fitted):
     assert float(rows[0]["add_to_reading"]) == 0.0  # the first joint's offset cannot be told from the station
 
 
-def test_offsets_beside_corrections_have_the_sigmas_of_the_geometry_without_them(tmp_path):
+def test_offsets_have_sigmas_of_geometry(tmp_path):
+    """Offsets beside corrections have the sigmas of the geometry without them."""
     chain = load("ur5")
     moved = CorrectedChain(chain, Deflection((Term("theta2", "cos", 1, 1),), np.array([1e-3]), chain))
     covariance = np.diag(np.arange(1.0, len(chain.elements) + 1.0)) * 1e-8
@@ -109,7 +112,8 @@ def test_offsets_beside_corrections_have_the_sigmas_of_the_geometry_without_them
     np.testing.assert_allclose(sigmas, np.sqrt(1e-8 * (chain.moving + 1.0)))
 
 
-def test_ur_kinematics_give_the_calibrated_poses_in_the_frames_of_ur_description(cell, calib, fitted):
+def test_ur_kinematics_keep_calibrated_poses(cell, calib, fitted):
+    """UR kinematics give the calibrated poses in the frames of ur_description."""
     assert calib("export", fitted, "--ur-kinematics", "kinematics.yaml")[0] == 0
     text = Path("kinematics.yaml").read_text()
     assert re.search(r"^  hash: calib_\d+$", text, re.MULTILINE)
@@ -141,7 +145,7 @@ def test_the_source_is_never_written_over(cell, calib, fitted):
 
 
 @pytest.mark.parametrize("old", [False, True])
-def test_what_is_mounted_behind_wrist_3_is_not_in_its_kinematics(cell, calib, old):
+def test_flange_is_outside_ur_kinematics(cell, calib, old):
     """A flange 0.109 m behind the last joint, as in ur10_ipa; URDFs of old have UR's own d6 there instead."""
     text, name = write_new(cell.nominal), "wrist_3_joint"
     plain = re.search(rf'<joint name="{name}".*?<origin xyz="([^"]+)" rpy="([^"]+)"', text, re.DOTALL)
@@ -167,7 +171,8 @@ def test_what_is_mounted_behind_wrist_3_is_not_in_its_kinematics(cell, calib, ol
     assert float(wrist[1]) == pytest.approx(0.0823, abs=2e-3)
 
 
-def test_an_arm_without_ur_axes_has_no_ur_kinematics(cell, calib):
+def test_other_axes_have_no_ur_kinematics(cell, calib):
+    """An arm without UR axes has no UR kinematics."""
     from calib.procedure.export.ur_kinematics import kinematics
     from calib.robot.calibrated import CalibratedChain
 
@@ -176,7 +181,8 @@ def test_an_arm_without_ur_axes_has_no_ur_kinematics(cell, calib):
         kinematics(CalibratedChain(panda, panda))
 
 
-def test_a_failed_result_is_exported_with_its_verdict_and_exit_code_1(cell, calib, fitted):
+def test_failed_result_exports_with_code_1(cell, calib, fitted):
+    """A failed result is exported with its verdict and exit code 1."""
     code, _, _ = calib("fit", "source.urdf", "a.csv", "--holdout", "0.25", "--tolerance", "1e-6", "--model", "geometry",
                        "--out", "bad")  # fmt: skip
     assert code == 1
@@ -193,7 +199,8 @@ def test_a_failed_result_is_exported_with_its_verdict_and_exit_code_1(cell, cali
     assert "verdict fail" not in Path("x/README.txt").read_text() + Path("x/robot.urdf").read_text()
 
 
-def test_a_marginal_result_is_exported_with_what_made_it_marginal(cell, calib, fitted):
+def test_marginal_result_exports_its_reason(cell, calib, fitted):
+    """A marginal result is exported with what made it marginal."""
     rows = [row | {"q3": row["q3"] + 0.3} for row in cell.measure(60)]
     assert calib("fit", "source.urdf", cell.write("b.csv", rows), "--model", "geometry", "--out", "odd")[0] == 0
     code, out, _ = calib("export", "odd", "--into", "x")
@@ -217,7 +224,7 @@ def test_a_marginal_result_is_exported_with_what_made_it_marginal(cell, calib, f
     )
 
 
-def test_a_link_and_a_joint_of_one_name_are_told_apart():
+def test_link_and_joint_of_one_name():
     """As in Sawyer's description, whose last fixed joint is called as its link; here the moving ones, too."""
     source = robot(
         joint("one", "revolute", "base", "one", axis("0 0 1"), "0.1 0 0.2"),

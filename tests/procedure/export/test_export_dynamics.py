@@ -79,7 +79,8 @@ def write_identification(folder: Path, source: str, seed: int = 0, factor: float
 
 
 @pytest.mark.parametrize("kind", ["revolute", "prismatic"])
-def test_urdf_mjcf_and_tables_hold_the_same_robot(tmp_path, kind):
+def test_urdf_mjcf_and_tables_agree(tmp_path, kind):
+    """URDF, MJCF and tables hold the same robot."""
     source = SOURCE.replace("AXIS", kind)
     (tmp_path / "source.urdf").write_text(source)
     folder = write_identification(tmp_path / "found", source)
@@ -133,13 +134,14 @@ def check_torques_with_pinocchio(path: Path, given: identified.IdentifiedRobot) 
         ("", 1.2, "payload-not-exported"),
     ],
 )
-def test_masses_that_are_not_the_descriptions_are_said(tmp_path, change, factor, code):
+def test_masses_unlike_the_source_are_said(tmp_path, change, factor, code):
+    """Masses that are not the description's are said."""
     source = SOURCE.replace("AXIS", "revolute").replace(change, change.replace("0.03", "0.9"))
     found = write_identification(tmp_path, source, factor=factor, loaded=code == "payload-not-exported")
     assert any(catalogue()[code].says.split("{")[0] in line for line in identified.notes_of(identified.read(found)))
 
 
-def test_an_estimate_far_from_every_robot_is_said_with_what_costs_most(tmp_path):
+def test_estimate_far_from_robots_is_said(tmp_path):
     """The torques of bodies with negative masses."""
     write_identification(tmp_path, SOURCE.replace("AXIS", "revolute"), factor=-1.0)
     line = next(line for line in identified.notes_of(identified.read(tmp_path)) if "nearest" in line)
@@ -160,7 +162,8 @@ def test_all_else_of_the_source_stays(tmp_path):
     assert bare(source) == bare(after) and "<!-- mine -->" in after
 
 
-def test_tesseracts_yaml_moves_the_source_to_the_export(tmp_path):
+def test_tesseract_yaml_moves_to_the_export(tmp_path):
+    """Tesseract's YAML moves the source to the export."""
     yaml = pytest.importorskip("yaml")
     from scipy.spatial.transform import Rotation
 
@@ -178,7 +181,8 @@ def test_tesseracts_yaml_moves_the_source_to_the_export(tmp_path):
         assert np.abs(after.joints[name].origin[:3, :3] - turn).max() < 1e-9
 
 
-def test_a_cover_heavier_than_the_body_gives_way_and_a_finger_is_refused(tmp_path):
+def test_too_heavy_cover_gives_way(tmp_path):
+    """A cover heavier than the body gives way, and a finger is refused."""
     source = SOURCE.replace("AXIS", "revolute")
     folder = write_identification(tmp_path / "found", source)
     heavy = source.replace('<mass value="3"/>', '<mass value="30"/>')

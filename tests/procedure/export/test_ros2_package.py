@@ -53,7 +53,8 @@ def export(tmp_path):
     return Export(source, tmp_path / "fit", remark="verdict marginal: a & b < c")
 
 
-def test_a_package_is_what_ament_and_launch_read(tmp_path, export):
+def test_package_is_what_ament_reads(tmp_path, export):
+    """A package is what ament and launch read."""
     (tmp_path / "joint_limits.yaml").write_text(LIMITS)
     (tmp_path / "arm.srdf").write_text(SRDF)
     notes = write_package(export, "my_arm_description", tmp_path, moveit=[tmp_path], control=True)
@@ -72,7 +73,8 @@ def test_a_package_is_what_ament_and_launch_read(tmp_path, export):
     assert (package / "config/joint_limits.yaml").read_text() == LIMITS and (package / "config/arm.srdf").exists()
 
 
-def test_its_urdf_is_the_calibrated_robot_with_meshes_of_the_package(tmp_path, export):
+def test_package_urdf_is_calibrated_robot(tmp_path, export):
+    """The URDF of a package is the calibrated robot, with meshes of the package."""
     write_package(export, "my_arm_description", tmp_path, control=True)
     file, robot = tmp_path / "my_arm_description/urdf/my_arm.urdf", calibrated.read(tmp_path / "fit").chain
     model = pinocchio.buildModelFromUrdf(str(file))
@@ -89,7 +91,8 @@ def test_its_urdf_is_the_calibrated_robot_with_meshes_of_the_package(tmp_path, e
     assert "<!-- an arm -->" in file.read_text()
 
 
-def test_a_ros2_control_of_the_source_is_kept(tmp_path, export):
+def test_ros2_control_of_source_survives(tmp_path, export):
+    """A ros2_control of the source is kept."""
     own = '<ros2_control name="mine" type="system"><hardware><plugin>x/Y</plugin></hardware></ros2_control>'
     export.source.write_text(ARM.replace("</robot>", f"{own}</robot>"))
     write_package(export, "arm", tmp_path / "src", control=True)
@@ -99,7 +102,8 @@ def test_a_ros2_control_of_the_source_is_kept(tmp_path, export):
 @pytest.mark.parametrize(
     "name", ["Arm", "arm__description", "_arm", "1arm", "arm_", "arm-description", "", "a" * 60 + "A"]
 )
-def test_a_name_that_no_package_has_is_refused(tmp_path, export, name):
+def test_impossible_package_name_is_refused(tmp_path, export, name):
+    """A name that no package has is refused."""
     assert re.fullmatch(r"[a-z](_?[a-z0-9]+)*", name[:12]) is None or len(name) > 12
     with pytest.raises(UsageError, match="REP 149"):
         write_package(export, name, tmp_path / "src")
@@ -113,7 +117,8 @@ def test_names_are_those_of_rep_149():
     ]
 
 
-def test_another_robots_srdf_and_files_that_are_there_are_refused(tmp_path, export):
+def test_foreign_srdf_and_files_are_refused(tmp_path, export):
+    """Another robot's SRDF, and files that are there already, are refused."""
     (tmp_path / "other.srdf").write_text(SRDF.replace("foot", "panda_link0"))
     with pytest.raises(UsageError, match=r"none of its 1 disabled pairs .* another robot's"):
         write_package(export, "arm", tmp_path / "src", moveit=[tmp_path / "other.srdf"])

@@ -25,7 +25,8 @@ def origins(text: str) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("base", [None, "base_link", "base_link_inertia"])
-def test_urs_own_descriptions_give_back_their_origins(data, base):
+def test_ur_descriptions_keep_their_origins(data, base):
+    """UR's own descriptions give back their origins."""
     paths = sorted((data / "public_arms").glob("[uU]niversal*.urdf"))
     if not paths:
         pytest.skip(f"no public descriptions of UR arms in {data}")
@@ -41,7 +42,7 @@ def test_urs_own_descriptions_give_back_their_origins(data, base):
 
 
 @pytest.mark.parametrize("turn", [0.0, np.pi, 0.3])
-def test_a_base_without_urs_links_is_found_from_the_axes(turn):
+def test_foreign_base_is_found_from_axes(turn):
     """The library's UR5, its base turned about z: the lengths of UR's table, whatever the turn."""
     from dataclasses import replace
 

@@ -7,7 +7,8 @@ from calib.procedure.export.joint_origins import block
 yaml = pytest.importorskip("yaml")
 
 
-def test_numbers_are_read_as_numbers_to_the_last_digit() -> None:
+def test_numbers_are_read_to_the_last_digit() -> None:
+    """Numbers are read as numbers to the last digit."""
     values = {str(k): x for k, x in enumerate((1e-5, -1e22, 0.1, 0.0, 1.5e-300, 2.0**0.5))}
     read = yaml.safe_load(block({"joint": {"position": values}}))["joint"]["position"]
     assert read == values and all(isinstance(x, float) for x in read.values())

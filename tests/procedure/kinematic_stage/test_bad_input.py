@@ -17,7 +17,7 @@ from calib.procedure.kinematic_stage.inputs import load_robot
 POSE = ["q1", "q2", "q3", "q4", "q5", "q6", "x", "y", "z", "qx", "qy", "qz", "qw"]
 
 
-def test_impossible_measurements_end_in_one_line_and_leave_nothing(cell, calib):
+def test_impossible_poses_leave_nothing(cell, calib):
     """What is wrong with them, and how it is said: tests/data/poses/test_bad_measurements.py."""
     good = cell.measure(30)
     for rows, columns, word in (
@@ -30,7 +30,8 @@ def test_impossible_measurements_end_in_one_line_and_leave_nothing(cell, calib):
         assert sorted(path.name for path in cell.folder.iterdir()) == ["bad.csv"]
 
 
-def test_a_unit_that_is_stated_is_not_advised(cell, calib):
+def test_stated_unit_is_not_advised(cell, calib):
+    """A unit that is stated is not advised."""
     rows = [{(f"{k} [deg]" if k[0] == "q" else k): 57.3 * v for k, v in row.items()} for row in cell.measure(30)]
     for row in rows:
         row["q1 [deg]"] *= 60.0
@@ -38,7 +39,8 @@ def test_a_unit_that_is_stated_is_not_advised(cell, calib):
     assert (code, "read as [deg]" in err or "columns swapped" in err, "looks like" in err) == (2, True, False)
 
 
-def test_some_numbered_columns_may_be_named_by_the_urdfs_joints(tmp_path):
+def test_columns_may_be_named_by_urdf_joints(tmp_path):
+    """Some numbered columns may be named by the URDF's joints."""
     links = "".join(f'<link name="link_{k}"/>' for k in range(4))
     joints = "".join(
         f'<joint name="joint_{k + 1}" type="continuous"><parent link="link_{k}"/><child link="link_{k + 1}"/>'
@@ -81,7 +83,8 @@ def test_impossible_commands(cell, calib, arguments, word):
     assert sorted(path.name for path in cell.folder.iterdir()) == ["a.csv"]
 
 
-def test_too_few_poses_to_tell_the_parameters(cell, calib):
+def test_too_few_poses_for_the_parameters(cell, calib):
+    """Too few poses to tell the parameters are refused."""
     code, _, err = calib("select", "ur5", "-m", "3", "--out", "p.csv")
     assert (code, "at least 5 poses" in err, Path("p.csv").exists()) == (3, True, False)
 
@@ -110,7 +113,8 @@ def test_impossible_urdf(cell, calib, text, options, word):
     assert not Path("done").exists()
 
 
-def test_a_folder_that_holds_other_things_is_left_alone(cell, calib):
+def test_foreign_folder_is_unchanged(cell, calib):
+    """A folder that holds other things is left alone."""
     file = cell.write("a.csv", cell.measure(40))
     Path("mine").mkdir()
     Path("mine/robot.urdf").write_text("mine")
@@ -131,7 +135,8 @@ def test_a_read_only_folder(cell, calib):
     assert (code, "cannot write" in err) == (2, True)
 
 
-def test_a_full_disk_in_the_middle_leaves_nothing(cell, calib, monkeypatch):
+def test_full_disk_leaves_nothing(cell, calib, monkeypatch):
+    """A disk that fills up in the middle leaves nothing."""
     from calib import files
 
     file, whole = cell.write("a.csv", cell.measure(40)), files.write_json
@@ -159,7 +164,8 @@ def test_a_killed_fit_leaves_no_folder(cell):
     assert not Path("done").exists()
 
 
-def test_a_number_that_is_not_finite_is_never_written(tmp_path):
+def test_infinite_number_is_never_written(tmp_path):
+    """A number that is not finite is never written."""
     from calib import files
 
     with pytest.raises(CalibError, match=r"fit\.rms\[1\] is not a finite number"):
@@ -167,7 +173,8 @@ def test_a_number_that_is_not_finite_is_never_written(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_poses_copied_ten_times_are_twenty_poses(cell, calib):
+def test_poses_copied_ten_times_are_twenty(cell, calib):
+    """Poses copied ten times are twenty poses."""
     rows = cell.measure(20)
     cell.write("once.csv", rows)
     cell.write("copied.csv", 10 * rows)
@@ -188,7 +195,8 @@ def test_a_pipe_that_nobody_fills_is_refused(cell, calib, given):
     assert (code, "pipe: cannot be read: is a pipe" in err) == (2, True), err
 
 
-def test_what_is_refused_is_quoted_as_it_was_written(cell, calib):
+def test_refused_text_is_quoted_as_written(cell, calib):
+    """What is refused is quoted as it was written."""
     rows = [row | {f"sigma_{axis}": -1e-5 for axis in "xyz"} for row in cell.measure(20)]
     file = cell.write("a.csv", rows)
     code, _, err = calib("fit", "ur5", file, "--out", "o")

@@ -99,7 +99,7 @@ def off(one: np.ndarray, two: np.ndarray) -> tuple[float, float]:
     return float(np.sqrt(np.mean(shift**2))), float(np.sqrt(np.mean(turn**2)))
 
 
-def test_poses_in_the_instruments_frame_are_met_by_the_true_tool(cell, fitted, here, calib):
+def test_true_tool_meets_poses_of_instrument(cell, fitted, here, calib):
     """Round trip against the hidden truth: what is left is the model's own error, as the held-out poses state it."""
     wanted = true_poses(cell, drawn(cell, 120, 5))
     write(here / "t.csv", ["x [mm]", "y [mm]", "z [mm]", "qx", "qy", "qz", "qw", *Q], np.hstack(
@@ -125,7 +125,8 @@ def test_poses_in_the_instruments_frame_are_met_by_the_true_tool(cell, fitted, h
     assert f"expected error of the real arm at these targets: {1e3 * np.sqrt(np.mean(expected**2)):.3g} mm rms" in out
 
 
-def test_targets_outside_the_measured_range_are_named_and_expected_to_be_worse(cell, fitted, here, calib):
+def test_targets_outside_range_are_worse(cell, fitted, here, calib):
+    """Targets outside the measured range are named, and expected to be worse."""
     q = np.array([[0.5, -1.2, 1.3, 0.4, 0.9, 0.2], [3.0, -1.2, 1.3, 0.4, 0.9, 3.1]])
     write(here / "t.csv", Q, q)
     out = commanded(calib, fitted)
@@ -140,7 +141,8 @@ def test_targets_outside_the_measured_range_are_named_and_expected_to_be_worse(c
 @pytest.mark.parametrize(
     ("first", "code"), [(0.5, "expected-as-unseen"), (3.1, "expected-beyond-range")], ids=["inside", "outside"]
 )
-def test_without_an_error_model_and_orientations_it_is_said(cell, fitted, here, first, code):
+def test_missing_error_model_is_said(cell, fitted, here, first, code):
+    """Where there is no error model, and where orientations are missing, it is said."""
     given = joint_commands.read(fitted)
     table = layout(given.cell)
     kept = [not table.names[k].endswith((".rx", ".ry", ".rz")) for k in given.free]
@@ -150,7 +152,7 @@ def test_without_an_error_model_and_orientations_it_is_said(cell, fitted, here, 
     assert "no orientations were measured" in said and catalogue()[code].says.split(":")[0] in said
 
 
-def test_joint_targets_are_the_nominal_robots_poses(cell, fitted, here, calib):
+def test_joint_targets_are_nominal_poses(cell, fitted, here, calib):
     """In the base that URDF users see: the calibrated flange, base to tip, stands where the nominal one would."""
     q = drawn(cell, 100, 6)
     write(here / "t.csv", [f"q{k + 1} [deg]" for k in range(6)], np.rad2deg(q))
@@ -173,7 +175,7 @@ def test_the_robots_file_is_parsed_once(cell, fitted, here, calib, monkeypatch):
     assert parsed == [(fitted / "robot.toml").read_text()]
 
 
-def test_the_nominal_frame_moves_the_arm_least(cell, fitted, here, calib):
+def test_nominal_frame_moves_the_arm_least(cell, fitted, here, calib):
     """Placed where it fits best, the nominal robot is off by what the fit reports as its error, and by no more."""
     write(here / "t.csv", Q, drawn(cell, 200, 7))
     metrics = json.loads((fitted / "metrics.json").read_text())["validation"]["seen.csv"]
@@ -187,7 +189,8 @@ def test_the_nominal_frame_moves_the_arm_least(cell, fitted, here, calib):
     assert f"({own} from the arm itself" in " ".join(said["base"].split()) and "the arm itself" not in said["nominal"]
 
 
-def test_positions_alone_are_sought_near_a_start(cell, fitted, here, calib):
+def test_positions_are_sought_near_a_start(cell, fitted, here, calib):
+    """Positions alone are sought near a start."""
     q = drawn(cell, 8, 8) * 0.3 + np.array([0.0, -1.2, 1.5, -1.0, -1.4, 0.3])
     poses = forward(cell.nominal, q)
     write(here / "t.csv", ["x", "y", "z"], poses[:, :3, 3])
@@ -200,7 +203,8 @@ def test_positions_alone_are_sought_near_a_start(cell, fitted, here, calib):
     assert all(row["left [mrad]"] == "" for row in rows)
 
 
-def test_a_tool_given_by_numbers_is_the_flange_moved(cell, fitted, here, calib):
+def test_tool_in_numbers_is_the_flange_moved(cell, fitted, here, calib):
+    """A tool given by numbers is the flange moved."""
     q = drawn(cell, 30, 9)
     tool = from_xyz_rpy([0.1, 0.0, 0.2], [0.0, 0.5, 0.0])
     at_tool = forward(cell.nominal, q) @ tool
@@ -212,7 +216,8 @@ def test_a_tool_given_by_numbers_is_the_flange_moved(cell, fitted, here, calib):
     assert np.abs(numbers(commands("a.csv"), Q) - numbers(commands("b.csv"), Q)).max() < 1e-7
 
 
-def test_what_is_out_of_reach_stops_all_or_is_left_empty(cell, fitted, here, calib):
+def test_unreachable_stops_all_or_is_empty(cell, fitted, here, calib):
+    """What is out of reach stops all, or is left empty."""
     q = drawn(cell, 3, 10)
     poses = forward(cell.nominal, q)
     poses[1, :3, 3] *= 3.0 / np.linalg.norm(poses[1, :3, 3])
@@ -264,7 +269,8 @@ def test_bad_targets_are_refused(fitted, here, calib, text, said):
     assert said in err
 
 
-def test_folders_and_words_that_do_not_serve_are_refused(fitted, here, calib):
+def test_unsuited_folders_and_words_fail(fitted, here, calib):
+    """Folders and words that do not serve are refused."""
     write(here / "t.csv", Q, np.zeros((1, 6)) + 0.5)
     (here / "empty").mkdir()
     (here / "half").mkdir()
@@ -284,14 +290,16 @@ def test_folders_and_words_that_do_not_serve_are_refused(fitted, here, calib):
     assert code == 2 and "t.csv is an input and would be overwritten" in err
 
 
-def test_one_target_and_the_same_one_twice_are_targets(fitted, here, calib):
+def test_one_or_repeated_targets_are_targets(fitted, here, calib):
+    """One target, and the same one twice, are targets."""
     for count in (1, 3):
         write(here / "t.csv", Q, np.full((count, 6), 0.7))
         commanded(calib, fitted)
         assert len(commands()) == count
 
 
-def test_the_file_of_targets_reads_as_documented(here):
+def test_target_file_reads_as_documented(here):
+    """The file of targets reads as documented."""
     write(here / "t.csv", ["name", "x_target [mm]", "y_target [mm]", "z_target [mm]"], [[1, 400, 0, 500]])
     found = read_targets("t.csv", Q)
     assert found.ignored == ("name",) and found.q is None
@@ -307,9 +315,8 @@ CASES = [  # folder, robot, file, held-out share, goal [mm]
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("folder", "robot", "file", "share", "goal"), CASES)
-def test_commands_for_measured_poses_are_the_joints_they_were_measured_at(
-    data, tmp_path, capsys, folder, robot, file, share, goal
-):
+def test_measured_poses_give_their_joints(data, tmp_path, capsys, folder, robot, file, share, goal):
+    """Commands for measured poses are the joints they were measured at."""
     robot, file = data / folder / robot, data / folder / file
     arguments = ["fit", robot, file, "--holdout", share, "--out", tmp_path / "done", "--no-plots"]
     assert cli.run([str(each) for each in arguments]) == 0
@@ -349,7 +356,7 @@ LIN {{X {6:.6f}, Y {7:.6f}, Z {8:.6f}, A {9:.6f}, B {10:.6f}, C {11:.6f}, S 2, T
 """
 
 
-def test_targets_inside_a_program_are_rewritten(cell, fitted, here, calib):
+def test_targets_in_a_program_are_rewritten(cell, fitted, here, calib):
     """A joint target becomes the command that meets it, a pose the one that the nominal robot has there."""
     q = drawn(cell, 20, 5)[:1]
     pose = forward(cell.nominal, q)
@@ -368,7 +375,8 @@ def test_targets_inside_a_program_are_rewritten(cell, fitted, here, calib):
     np.testing.assert_allclose(found.joints(), numbers(commands(), Q), atol=2e-8)
 
 
-def test_a_target_of_a_program_that_is_not_reached_is_named_with_its_line(cell, fitted, here, calib):
+def test_unreached_target_has_its_line(cell, fitted, here, calib):
+    """A target of a program that is not reached is named with its line."""
     q = np.degrees(drawn(cell, 20, 5)[0])
     text = PROGRAM.format(*q, 9e3, 0, 0, 0, 0, 0, more="PTP {A1 400, A2 0, A3 0, A4 0, A5 0, A6 0}\nPTP_REL {A1 5}\n")
     (here / "part.src").write_text(text)
@@ -385,7 +393,8 @@ def test_a_target_of_a_program_that_is_not_reached_is_named_with_its_line(cell, 
     assert not (here / "no.src").exists()
 
 
-def test_registers_that_a_controller_saved_are_no_program_to_compensate(fitted, tmp_path, capsys):
+def test_saved_registers_are_no_program(fitted, tmp_path, capsys):
+    """Registers that a controller saved are no program to compensate."""
     (tmp_path / "POSREG.VA").write_text(
         "[1,1] =   'P1'   Group: 1\n" + "  ".join(f"J{k} = 1.0 deg" for k in range(1, 7))
     )

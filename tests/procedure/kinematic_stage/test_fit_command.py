@@ -35,7 +35,8 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_a_planted_arm_is_found_and_the_contract_is_kept(cell, calib):
+def test_planted_arm_is_found(cell, calib):
+    """A planted arm is found, and the contract is kept."""
     file, other = cell.write("day1.csv", cell.measure(60)), cell.write("day2.csv", cell.measure(40, 1))
     code, out, err = calib("fit", "ur5", file, "--validate", other, "--model", "geometry", "--out", "done")
     assert code == 0, err
@@ -59,7 +60,8 @@ def test_a_planted_arm_is_found_and_the_contract_is_kept(cell, calib):
     assert "verdict: pass" in out and "day2.csv" in out
 
 
-def test_the_files_of_a_fit_hold_the_same_robot(cell, calib):
+def test_files_of_a_fit_hold_the_same_robot(cell, calib):
+    """The files of a fit hold the same robot."""
     file = cell.write("day1.csv", cell.measure(60))
     assert calib("fit", "ur5", file, "--model", "geometry", "--out", "done")[0] == 0
     q = np.random.default_rng(0).uniform(-2, 2, (20, 6))
@@ -107,7 +109,8 @@ def test_residuals_are_those_of_the_metrics(cell, calib):
     assert 9.0 < worst["size_mm"] < 11.0
 
 
-def test_holdout_keeps_the_last_share_of_the_permutation(cell, calib):
+def test_holdout_is_end_of_the_permutation(cell, calib):
+    """Holdout keeps the last share of the permutation."""
     file = cell.write("day1.csv", cell.measure(60))
     start = ("fit", "ur5", file, "--holdout", "0.25", "--seed", "3", "--model", "offsets", "--out", "done")
     assert calib(*start)[0] in (0, 1)
@@ -126,7 +129,8 @@ def test_holdout_keeps_the_last_share_of_the_permutation(cell, calib):
     assert {out for *_, out in unseen} <= {0.0, 1.0} and all(0 < sigma < radius for _, sigma, radius, _ in unseen)
 
 
-def test_a_pose_file_from_another_station_needs_refitted_frames(cell, calib):
+def test_other_station_needs_refitted_frames(cell, calib):
+    """A pose file from another station needs refitted frames."""
     elsewhere = from_xyz_rpy([-2.0, 1.0, 0.0], [0.0, 0.4, 1.0])
     columns = list(cell.measure(1)[0])
     file = cell.write("a.csv", cell.measure(50), columns)
@@ -143,7 +147,8 @@ def test_a_pose_file_from_another_station_needs_refitted_frames(cell, calib):
     assert unseen["calibrated"]["position_mm"]["rms"] < 0.1 < unseen["nominal"]["position_mm"]["rms"]
 
 
-def test_two_files_have_two_stations_unless_one_is_asked_for(cell, calib):
+def test_two_files_have_two_stations(cell, calib):
+    """Two files have two stations unless one is asked for."""
     file, other = cell.write("a.csv", cell.measure(40)), cell.write("b.csv", cell.measure(40, 1))
     assert calib("fit", "ur5", file, other, "--model", "frames", "--out", "each")[0] == 0
     assert installation.read("each").station_names == ("a", "b")
@@ -153,7 +158,8 @@ def test_two_files_have_two_stations_unless_one_is_asked_for(cell, calib):
     assert installation.read("tools").tool_names == ("a tool", "b tool")
 
 
-def test_one_station_for_an_instrument_that_was_moved_is_said(cell, calib):
+def test_one_station_of_a_moved_instrument(cell, calib):
+    """One station for an instrument that was moved is said."""
     moved = from_xyz_rpy([1.8, -0.8, 0.5], [0.1, -0.2, 2.2])
     file, other = cell.write("a.csv", cell.measure(40)), cell.write("b.csv", cell.measure(40, 1, moved))
     start = ("fit", "ur5", file, other, "--model", "geometry", "--out", "done")
@@ -161,7 +167,8 @@ def test_one_station_for_an_instrument_that_was_moved_is_said(cell, calib):
     assert "with stations 'each'" not in calib(*start)[1]
 
 
-def test_rows_that_count_twice_are_said_and_copies_prove_nothing(cell, calib):
+def test_repeated_rows_prove_nothing(cell, calib):
+    """Rows that count twice are said, and copies prove nothing."""
     rows = cell.measure(40)
     file, copy = cell.write("a.csv", [*rows, rows[2]]), cell.write("copy.csv", rows[:20])
     start = ("fit", "ur5", file, "--model", "geometry", "--out", "done")
@@ -173,7 +180,8 @@ def test_rows_that_count_twice_are_said_and_copies_prove_nothing(cell, calib):
     assert "with the numbers" not in calib("fit", "ur5", cell.write("b.csv", cell.measure(40, 5)), *start[3:])[1]
 
 
-def test_validation_files_may_follow_one_option_or_each_its_own(cell, calib):
+def test_validation_files_share_an_option(cell, calib):
+    """Validation files may follow one option, or each its own."""
     file = cell.write("a.csv", cell.measure(40))
     for name, seed in (("b.csv", 1), ("c.csv", 2)):
         cell.write(name, cell.measure(30, seed))
@@ -188,7 +196,8 @@ def test_validation_files_may_follow_one_option_or_each_its_own(cell, calib):
     assert found["three"]["fit"] == found["one"]["fit"]
 
 
-def test_the_same_seed_gives_the_same_numbers(cell, calib):
+def test_same_seed_gives_the_same_numbers(cell, calib):
+    """The same seed gives the same numbers."""
     file = cell.write("a.csv", cell.measure(40))
     for name in ("one", "two"):
         assert calib("fit", "ur5", file, "--holdout", "0.3", "--seed", "4", "--out", name)[0] == 0
@@ -196,7 +205,8 @@ def test_the_same_seed_gives_the_same_numbers(cell, calib):
     assert Path("one/estimate.csv").read_bytes() == Path("two/estimate.csv").read_bytes()
 
 
-def test_a_calibrated_folder_is_a_robot_and_a_worse_arm_fails(cell, calib):
+def test_calibrated_folder_is_a_robot(cell, calib):
+    """A calibrated folder is a robot, and a worse arm fails."""
     file = cell.write("a.csv", cell.measure(60))
     assert calib("fit", "ur5", file, "--model", "geometry", "--out", "arm")[0] == 0
     # five noisy poses more, full of gross errors: what is fitted to them is worse than the arm was
@@ -215,7 +225,7 @@ def test_a_calibrated_folder_is_a_robot_and_a_worse_arm_fails(cell, calib):
 
 
 @pytest.mark.parametrize("deliverable", ["urdf", "corrections"])
-def test_calibrated_is_robot_urdf_in_console_report_and_certificate(cell, calib, deliverable):
+def test_deliverable_comes_first_everywhere(cell, calib, deliverable):
     """The deliverable's figure comes first in each, the alternative's has its words; plots show the deliverable."""
     file = cell.write("a.csv", cell.measure(90))
     asked = ("--model", "coupling", "--holdout", 0.25, "--deliverable", deliverable, "--out", "done")
@@ -238,7 +248,8 @@ def test_calibrated_is_robot_urdf_in_console_report_and_certificate(cell, calib,
     assert f"{nominal:.3g} mm rms before, {judged:.3g} mm after" == histogram.panels[0].title
 
 
-def test_deflections_go_out_as_a_table_with_its_formula_and_come_back(cell, calib):
+def test_deflection_table_comes_back(cell, calib):
+    """Deflections go out as a table with its formula, and come back."""
     file = cell.write("a.csv", cell.measure(90))
     assert calib("fit", "ur5", file, "--model", "coupling", "--out", "done")[0] == 0
     placed = installation.read("done")
@@ -284,7 +295,7 @@ def test_fixed_parameters_stay(cell, calib):
     assert values["theta4"] != before["theta4"]
 
 
-def test_gross_rows_reach_neither_the_urdf_nor_the_intervals(cell, calib):
+def test_gross_rows_stay_out_of_deliverables(cell, calib):
     """The loss that auto takes for them counts for all that comes of the fit, not for the calibrated arm alone."""
 
     def gears(count: int, seed: int) -> list[dict[str, float]]:
@@ -302,7 +313,8 @@ def test_gross_rows_reach_neither_the_urdf_nor_the_intervals(cell, calib):
     assert alone[1] < 1.2 * alone[0] and radius[1] < 1.5 * radius[0]
 
 
-def test_refitting_a_fits_own_folder_is_no_failure(cell, calib):
+def test_refitting_own_folder_is_no_failure(cell, calib):
+    """Refitting a fit's own folder is no failure."""
     file = cell.write("a.csv", cell.measure(60))
     assert calib("fit", "ur5", file, "--out", "arm")[0] == 0
     code, out, _ = calib("fit", "arm", file, "--out", "again")
@@ -311,7 +323,8 @@ def test_refitting_a_fits_own_folder_is_no_failure(cell, calib):
     assert (code, "verdict: fail" in out) == (0, False)
 
 
-def test_a_tolerance_is_held_against_unseen_rows_and_named(cell, calib):
+def test_tolerance_is_tested_on_unseen_rows(cell, calib):
+    """A tolerance is held against unseen rows, and named."""
     file = cell.write("a.csv", cell.measure(60))
     start = ("fit", "ur5", file, "--model", "geometry", "--holdout", "0.25", "--out", "done")
     for tolerance, code, word in (("0.5", 0, "within the tolerance of 0.5 mm"), ("0.001", 1, "above the tolerance")):
@@ -321,7 +334,8 @@ def test_a_tolerance_is_held_against_unseen_rows_and_named(cell, calib):
     assert calib(*start, "--tolerance", "-1")[0] == 2
 
 
-def test_orientations_are_held_against_the_arm(cell, calib):
+def test_orientations_are_tested_on_the_arm(cell, calib):
+    """Orientations are held against the arm."""
     rows = cell.measure(40)
     names = ["qx", "qy", "qz", "qw"]
     for words, reading in (
@@ -339,7 +353,7 @@ def test_orientations_are_held_against_the_arm(cell, calib):
         assert (code, words in err) == (2 if words else 0, True), err
 
 
-def test_turned_orientations_fail_on_unseen_rows(cell, calib):
+def test_turned_orientations_fail(cell, calib):
     """Ten degrees about changing axes: not another convention, and no orientation of an arm."""
     rows, columns = cell.measure(60), list(cell.measure(1)[0])
     turns = Rotation.from_rotvec(np.radians(10.0) * _directions(60))
@@ -362,7 +376,8 @@ def _directions(count: int) -> np.ndarray:
     return axes / np.linalg.norm(axes, axis=1)[:, None]
 
 
-def test_a_placement_alone_is_validated_with_frames_of_its_own(cell, calib):
+def test_placement_has_its_validation_frames(cell, calib):
+    """A placement alone is validated with frames of its own."""
     file, other = cell.write("a.csv", cell.measure(60)), cell.write("b.csv", cell.measure(40, 1))
     code, out, err = calib("fit", "ur5", file, "--model", "frames", "--validate", other, "--refit-frames", "--out", "o")
     assert (code, "b.csv" in out) == (0, True), err
@@ -422,7 +437,7 @@ def test_a_kind_calibrates(cell, calib, measure, count, nature, poses):
         assert unseen["calibrated"]["distance_mm"] is None
 
 
-def test_a_placement_that_ran_out_of_steps_proves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unfinished_placement_proves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """The optimiser gets one linearisation for the file's own frames: what it leaves there means nothing."""
     cell = perturbed_cell(load("ur10"), 0, SimulatedInstrument("6-D probe", 30e-6, 1e-4), hidden=0.3)
     rng = np.random.default_rng(0)
@@ -447,7 +462,7 @@ def test_a_placement_that_ran_out_of_steps_proves_nothing(monkeypatch: pytest.Mo
     assert name not in again.verdict.reason and "cross-validation" in again.verdict.reason
 
 
-def test_a_file_that_its_own_placement_explains_proves_nothing(cell, calib) -> None:
+def test_self_explaining_file_proves_nothing(cell, calib) -> None:
     """Six positions are eighteen numbers, base and tool nine parameters; twelve positions leave enough."""
     file, other = cell.write("a.csv", cell.measure(60)), cell.measure(12, 1)
     for count, scored in ((6, False), (12, True)):

@@ -45,7 +45,8 @@ def iso(cell: Installation, block: Positions) -> RepeatedPoses:
     return found
 
 
-def test_accuracy_is_the_barycentre_from_the_command_in_the_bases_axes():
+def test_accuracy_is_barycentre_from_command():
+    """Accuracy is the barycentre from the command in the base's axes."""
     cell, block = repeated(shift=(1e-3, -2e-3, 3e-3))
     found = iso(cell, block)
     assert found.cycles == (8, 8) and found.poses == 4
@@ -55,7 +56,8 @@ def test_accuracy_is_the_barycentre_from_the_command_in_the_bases_axes():
     assert found.repeatability_mm["max"] < 1e-6
 
 
-def test_repeatability_is_the_mean_radius_and_three_deviations():
+def test_repeatability_is_mean_and_3_sigma():
+    """Repeatability is the mean radius and three deviations."""
     points = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 3.0, 0], [0, -3.0, 0]])  # radii 1 1 3 3
     assert repeatability.spread(points) == pytest.approx(2.0 + 3.0 * np.sqrt(4.0 / 3.0))
     found = iso(*repeated(poses=3, cycles=400, spread=1e-4, seed=1))
@@ -63,7 +65,8 @@ def test_repeatability_is_the_mean_radius_and_three_deviations():
     assert [one.repeatability_mm / 0.1 for one in found.each] == pytest.approx([1.596 + 3 * 0.673] * 3, rel=0.1)
 
 
-def test_turns_are_counted_about_the_bases_axes():
+def test_turns_count_about_axes_of_the_base():
+    """Turns are counted about the base's axes."""
     cell, block = repeated(poses=1, cycles=400)
     rng, base = np.random.default_rng(2), Rotation.from_matrix(STATION[:3, :3])
     small = Rotation.from_rotvec(rng.normal(0.0, [1e-4, 2e-4, 3e-4], (400, 3)) + np.array([5e-4, 0.0, 0.0]))
@@ -73,7 +76,7 @@ def test_turns_are_counted_about_the_bases_axes():
     assert np.radians(one.repeatability_deg) == pytest.approx([3e-4, 6e-4, 9e-4], rel=0.15)
 
 
-def test_what_depends_on_the_direction_of_approach_is_stated():
+def test_dependence_on_approach_is_stated():
     """A pose that is reached 0.1 mm short of where it comes from, alternately from two sides."""
     chain = load("ur5")
     cell = Installation(chain, STATION[None])
@@ -93,7 +96,8 @@ def test_what_depends_on_the_direction_of_approach_is_stated():
     assert found.cycles == (6, 12)
 
 
-def test_copies_and_single_poses_are_no_repeats():
+def test_copies_are_no_repeats():
+    """Copies and single poses are no repeats."""
     cell, block = repeated(poses=3, cycles=1)
     assert repeatability.repeated_poses((cell, cell), [block]) is None
     copy = [0] * 9 + [1, 2]
@@ -101,7 +105,8 @@ def test_copies_and_single_poses_are_no_repeats():
     assert repeatability.repeated_rows(block) == []
 
 
-def test_cycles_of_a_pose_are_held_out_together():
+def test_cycles_are_held_out_together():
+    """Cycles of a pose are held out together."""
     _, block = repeated(poses=10, cycles=5, spread=1e-5)
     kept, aside = inputs.hold_out(block, 0.3, 1)
     assert aside is not None and (len(kept), len(aside)) == (35, 15)
@@ -124,7 +129,8 @@ def files(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
-def test_the_fit_states_them_beside_its_own_errors(files, capsys):
+def test_fit_states_iso_beside_its_errors(files, capsys):
+    """The fit states the figures of ISO 9283 beside its own errors."""
     arguments = ["fit", "ur5", "fit.csv", "--validate", "iso.csv", "--model", "geometry", "--out", "done", "--no-plots"]
     assert cli.run([*arguments, "--stations", "one"]) == 0
     said = capsys.readouterr().out
@@ -139,7 +145,8 @@ def test_the_fit_states_them_beside_its_own_errors(files, capsys):
     assert len(table.rows) == 5 and "100 or more" in table.note
 
 
-def test_a_validation_at_the_fits_joints_proves_nothing(files, capsys):
+def test_validation_at_fit_joints_is_void(files, capsys):
+    """A validation at the fit's joints proves nothing."""
     code = cli.run(
         ["fit", "ur5", "fit.csv", "--validate", "again.csv", "--model", "geometry", "--out", "done", "--no-plots"]
     )

@@ -76,7 +76,7 @@ def test_frames_alone_are_judged_too(cell, calib, change, name):
         *(pytest.param("geometry", joints, marks=SLOW) for joints in ((1,), (2, 5))),
     ],
 )
-def test_joints_that_turn_the_other_way_are_named(cell, calib, reversed_ones, model):
+def test_joints_turning_backwards_are_named(cell, calib, reversed_ones, model):
     """The full geometry explains a reversed joint by axes turned by 180°, so that what it leaves tells nothing."""
     rows = cell.measure(COUNT)
     for row in rows:
@@ -90,7 +90,7 @@ def test_joints_that_turn_the_other_way_are_named(cell, calib, reversed_ones, mo
 
 
 @pytest.mark.slow
-def test_angles_of_another_convention_are_named(cell, calib):
+def test_angles_of_another_convention_named(cell, calib):
     """A controller's A B C turn about moving axes z y x; here they are stated as fixed ones."""
     rows = cell.measure(COUNT)
     for row in rows:
@@ -113,7 +113,8 @@ def test_angles_of_another_convention_are_named(cell, calib):
         ({"q2": ("q3", "q3", 0.0), "q3": ("q2", "q2", 0.0)}, "joints-exchanged", {"rival": None}),
     ],
 )  # fmt: skip
-def test_joints_that_count_from_another_or_are_exchanged_are_named(cell, calib, change, code, values, model):
+def test_coupled_or_swapped_joints_are_named(cell, calib, change, code, values, model):
+    """Joints that count from another or are exchanged are named."""
     rows = cell.measure(COUNT)
     for row in rows:
         row |= {name: row[one] + way * row[other] for name, (one, other, way) in change.items()}
@@ -127,7 +128,7 @@ def test_joints_that_count_from_another_or_are_exchanged_are_named(cell, calib, 
 
 
 @pytest.mark.parametrize("degrees", [90, -90, 180])
-def test_a_zero_off_by_quarters_of_a_turn_is_named(cell, calib, degrees):
+def test_quarter_turn_zeros_are_named(cell, calib, degrees):
     """The full geometry explains it by axes that are turned by 180°, or nearly so."""
     rows = [row | {"q3": row["q3"] + np.radians(degrees)} for row in cell.measure(COUNT)]
     code, _, err = fitted(cell, calib, rows, "frames")
@@ -137,7 +138,8 @@ def test_a_zero_off_by_quarters_of_a_turn_is_named(cell, calib, degrees):
     assert abs(np.degrees(found["angle"]) + degrees) % 360 < 1e-6
 
 
-def test_a_joint_counted_from_another_zero_is_told(cell, calib):
+def test_joint_from_another_zero_is_told(cell, calib):
+    """A joint counted from another zero is told."""
     rows = [row | {"q3": row["q3"] + np.radians(20)} for row in cell.measure(COUNT)]
     code, out, _ = fitted(cell, calib, rows, "geometry")
     assert (code, *verdict()) == (0, "marginal", "moved", ["moved"])
@@ -150,7 +152,7 @@ def test_a_joint_counted_from_another_zero_is_told(cell, calib):
 @pytest.mark.parametrize(
     ("first", "way"), [(1, "down"), (1, "up"), pytest.param(20, "down", marks=SLOW), pytest.param(20, "up", marks=SLOW)]
 )
-def test_rows_paired_with_the_joints_of_others_are_named(cell, calib, first, way):
+def test_misaligned_rows_are_named(cell, calib, first, way):
     """A point that was lost or measured twice moves all later ones against the joints."""
     rows, by = cell.measure(COUNT), -1 if way == "down" else 1
     joints = [{name: row[name] for name in row if name[0] == "q" and name[1].isdigit()} for row in rows]
@@ -198,7 +200,8 @@ def with_targets(rows: list[dict], change) -> None:
         (lambda k, first, second: [0, 0, 0] if k in (3, 9, 21) else second, {"reading-repeated"}),
     ],
 )
-def test_copied_and_placeholder_readings_are_named(cell, calib, change, codes):
+def test_copied_readings_are_named(cell, calib, change, codes):
+    """Copied and placeholder readings are named."""
     with_targets(cell.measure(COUNT), change)
     calib("fit", "ur5", "m.csv", "--out", "o", "--model", "frames")
     found = {code: one for code, one in noticed().items() if code in ("target-copied", "reading-repeated")}
@@ -212,7 +215,8 @@ def test_copied_and_placeholder_readings_are_named(cell, calib, change, codes):
 @pytest.mark.parametrize(
     "factor, level", [(1.0, None), (1.05, "fail"), (0.97, "fail"), (0.98, "marginal"), (1.003, "note")]
 )
-def test_one_factor_on_all_lengths_is_the_instruments_or_another_robots(cell, calib, factor, level):
+def test_common_factor_has_two_causes(cell, calib, factor, level):
+    """One factor on all lengths is the instrument's or another robot's."""
     fitted(cell, calib, changed(cell, lambda place: factor * place), "frames")
     found = [one for code, one in noticed().items() if catalogue()[code].accept == "scale"]
     assert [level_of(one) for one in found] == ([] if level is None else [level])
@@ -222,7 +226,7 @@ def test_one_factor_on_all_lengths_is_the_instruments_or_another_robots(cell, ca
 
 
 @pytest.mark.parametrize("factor, told", [(1.0, False), (1.002, True)])
-def test_lengths_that_grew_together_are_noted_whatever_else_was_wrong(cell, calib, factor, told):
+def test_lengths_that_grow_alike_are_noted(cell, calib, factor, told):
     """0.2 % is hidden in the errors of joints here, so that one factor explains little of what the nominal leaves."""
     rows = cell.measure(COUNT)
     for row in rows:
@@ -235,7 +239,7 @@ def test_lengths_that_grew_together_are_noted_whatever_else_was_wrong(cell, cali
         assert size["factor"] == pytest.approx(factor, abs=3 * size["sigma"] + 5e-4) and level_of(found) == "note"
 
 
-def test_lengths_of_another_size_that_joint_errors_hide_are_another_robots(cell, calib):
+def test_hidden_length_factor_is_other_robot(cell, calib):
     """The nominal arm's error is mostly that of two joints here; the fitted lengths have one factor all the same."""
     near, off = {"q1": 0.0, "q2": -1.2, "q3": 1.3}, {"q2": 0.05, "q3": -0.05, "q5": 0.05}
     rows = [row for row in cell.measure(4000) if all(abs(row[q] - middle) < 0.8 for q, middle in near.items())]
@@ -258,7 +262,7 @@ def test_computed_positions_are_noted(cell, calib):
     assert verdict()[2] == ["commanded"] and lines_of([noticed()["commanded"]])[0] in out
 
 
-def test_positions_without_any_error_leave_nothing_to_gain(cell, calib):
+def test_exact_positions_leave_no_gain(cell, calib):
     """No step is better than the start here: the residuals are rounding."""
     rows = changed(cell, lambda _: computed(cell))
     code, _, err = fitted(cell, calib, rows)
@@ -267,7 +271,8 @@ def test_positions_without_any_error_leave_nothing_to_gain(cell, calib):
 
 
 @pytest.mark.parametrize("columns", ["tool_position,socket", "bar,distance"])
-def test_one_row_per_socket_or_bar_tells_nothing(cell, calib, columns):
+def test_single_rows_per_socket_tell_nothing(cell, calib, columns):
+    """One row per socket or bar tells nothing."""
     rows = ["0.1,0.2,0.3,0.4,0.5,0.6,a,0.5", "0.2,0.2,0.3,0.4,0.5,0.6,b,0.5"]
     Path("m.csv").write_text("\n".join([f"q1,q2,q3,q4,q5,q6,{columns}", *rows, ""]))
     code, _, err = calib("fit", "ur5", "m.csv", "--out", "o")
@@ -277,7 +282,8 @@ def test_one_row_per_socket_or_bar_tells_nothing(cell, calib, columns):
 @pytest.mark.parametrize(
     "sigma, said", [("1e-300", "is the unit right"), ("1e300", "is the unit right"), ("0", "above 0")]
 )
-def test_sigmas_that_no_instrument_has_are_refused(cell, calib, sigma, said):
+def test_impossible_sigmas_are_refused(cell, calib, sigma, said):
+    """Sigmas that no instrument has are refused."""
     rows = [row | dict.fromkeys(("sigma_x", "sigma_y", "sigma_z"), sigma) for row in cell.measure(20)]
     columns = [*(f"q{j + 1}" for j in range(6)), *"xyz", "sigma_x", "sigma_y", "sigma_z"]
     code, _, err = calib("fit", "ur5", cell.write("m.csv", rows, columns), "--out", "o")

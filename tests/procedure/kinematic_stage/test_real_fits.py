@@ -35,7 +35,7 @@ def test_ur5_tracker(data, calib, here):
     assert 0.1 < geometry["cross_validated_mm"] < 0.14
 
 
-def test_a_tolerance_holds_for_each_file_that_is_delivered(data, calib, here):
+def test_tolerance_holds_for_delivered_files(data, calib, here):
     """0.107 mm calibrated, 0.060 mm with joint corrections."""
     folder = data / "ur5_gts3800"
     given = (folder / "model.urdf", folder / "grid_800.csv", "--holdout", "0.25", "--tolerance", "0.1", "--no-plots")

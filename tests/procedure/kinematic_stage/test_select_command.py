@@ -43,7 +43,8 @@ def write_poses(path: str, count: int, seed: int) -> None:
     np.savetxt(path, q, delimiter=",", header=",".join(load("ur5").joint_names), comments="")
 
 
-def test_better_than_chance_and_near_the_bound(cell, calib):
+def test_selection_is_near_the_bound(cell, calib):
+    """The selection is better than chance, and near the bound."""
     code, out, err = calib("select", "ur5", "-m", "12", "--candidates", "300", "--out", "p.csv", "--seed", "1")
     assert code == 0, err
     found = selection.choose("ur5", 12, SelectionSettings(candidates=300, seed=1))
@@ -56,7 +57,8 @@ def test_better_than_chance_and_near_the_bound(cell, calib):
 
 
 @pytest.mark.parametrize(("tool", "count"), [((0, 0, 0.1), 25), ((0.05, 0, 0.1), 27)])
-def test_the_columns_of_positions_are_those_that_can_be_told(tool, count):
+def test_columns_of_positions_can_be_told(tool, count):
+    """The columns of positions are those that can be told."""
     assert len(observation(targets_of(load("ur5"), [tool]), "position").free) == count
 
 
@@ -80,7 +82,8 @@ def test_chosen_poses_keep_the_constraints(cell, calib):
     assert not all((constraint.function(np.zeros((1, 6))) <= 0).all() for constraint in limits.constraints)
 
 
-def test_the_gradients_of_the_constraints_are_those_of_central_differences(cell):
+def test_gradient_is_central_difference(cell):
+    """The gradients of the constraints are those of central differences."""
     from calib.poses.space import central_difference
 
     Path("c.toml").write_text(CONSTRAINTS)
@@ -121,7 +124,8 @@ def test_nothing_feasible_says_so(cell, calib):
     assert "0 " in err
 
 
-def test_what_is_sent_to_other_processes_pickles(cell):
+def test_objects_for_processes_can_pickle(cell):
+    """What is sent to other processes can be pickled."""
     Path("c.toml").write_text(CONSTRAINTS)
     arm = targets_of(load("ur5"))
     limits, seen = read_limits(Path("c.toml"), arm), observation(arm, "position")
@@ -134,7 +138,8 @@ def test_what_is_sent_to_other_processes_pickles(cell):
 @pytest.mark.parametrize(
     ("out", "words"), [("before.csv", "is an input"), ("rules.toml", "is an input"), (".", "is a folder")]
 )
-def test_nothing_is_written_onto_what_is_read(cell, calib, out, words):
+def test_input_files_are_not_overwritten(cell, calib, out, words):
+    """Nothing is written onto what is read."""
     Path("rules.toml").write_text("[target]\nreach = 0.9\n")
     write_poses("before.csv", 8, 0)
     kept = {name: Path(name).read_bytes() for name in ("before.csv", "rules.toml")}
@@ -150,7 +155,8 @@ def _poses(path: str, names: tuple[str, ...], more: str = "") -> bytes:
     return Path(path).read_bytes()
 
 
-def test_a_file_that_an_earlier_run_did_not_leave_is_kept(cell, calib) -> None:
+def test_unrelated_file_stays(cell, calib) -> None:
+    """A file that an earlier run did not leave is kept."""
     names = load("ur5").joint_names
     kept = {
         "measured.csv": _poses("measured.csv", names, ",0.1,0.2,0.3"),

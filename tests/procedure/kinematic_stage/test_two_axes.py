@@ -36,14 +36,15 @@ def measured(side: float, rows: int = 60) -> tuple[Installation, Sequence[PoseMe
     return polish_frames(install(chain, blocks), blocks).cell, blocks
 
 
-def test_a_growth_that_placements_explain_has_no_factor():
+def test_explained_growth_has_no_factor():
     """The turning axis intersects the tilting one, so that base and tool grow with the table."""
     assert scale_of(*measured(0.0)) is None
     found = scale_of(*measured(0.3))
     assert found is not None and abs(found.factor - 1.0) < 4.0 * found.sigma < 0.01
 
 
-def test_no_change_of_columns_is_named_for_a_sound_table():
+def test_sound_table_needs_no_exchange():
+    """No change of columns is named for a sound table."""
     assert wrong_columns(*measured(0.0), mirrored=True) is None
 
 
@@ -60,7 +61,7 @@ def test_the_public_positioner(data, calib, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("step", [1, 17])
 @pytest.mark.parametrize("holdout", [(), ("--holdout", "0.25")])
-def test_twelve_rows_of_a_positioner_get_an_answer(data, calib, tmp_path, monkeypatch, holdout, step):
+def test_twelve_positioner_rows_are_answered(data, calib, tmp_path, monkeypatch, holdout, step):
     """Of the first twelve rows one joint stands still, and no model of the arm can be better than the nominal one."""
     monkeypatch.chdir(tmp_path)
     folder = data / "positioner_2axis"

@@ -100,7 +100,8 @@ def test_rules(unseen, changes, level, code):
     assert len(found.reason.split()) <= 25
 
 
-def test_each_deliverable_has_a_verdict_of_its_own():
+def test_deliverables_have_separate_verdicts():
+    """Each deliverable has a verdict of its own."""
     findings = Findings("geometry + harmonics", 1e-4, None, 0.0, 1.0, rigid_cross_validated=2e-4)
     fit, unseen = rows(1.0, 0.05, False, alone=0.1), {"a": rows(1.0, 0.06, alone=0.107)}
 

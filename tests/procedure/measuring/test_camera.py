@@ -41,7 +41,7 @@ def cell() -> camera.CameraCell:
     return camera.camera_cell(arm, lens=camera.DEMO_LENS, reach_of_arm=0.75)
 
 
-def test_a_posture_is_in_view_where_the_cell_sees_the_whole_board(cell):
+def test_view_has_to_hold_the_whole_board(cell):
     """Against the projection of every corner; the places in the file are rounded to centimetres."""
     with camera.limits_of(cell) as path:
         limits = read_limits(path, targets_of(cell.cell.nominal))
@@ -60,7 +60,8 @@ def test_a_posture_is_in_view_where_the_cell_sees_the_whole_board(cell):
 
 
 @pytest.mark.slow
-def test_chosen_poses_see_the_board_and_tell_what_images_tell(cell, tmp_path):
+def test_chosen_poses_see_the_board(cell, tmp_path):
+    """Chosen poses see the board, and tell what images tell."""
     with camera.limits_of(cell) as path:
         chosen = selection.choose("lwr4plus", 15, SelectionSettings(candidates=120), constraints=path)
         limits = read_limits(path, targets_of(cell.cell.nominal))
@@ -72,7 +73,8 @@ def test_chosen_poses_see_the_board_and_tell_what_images_tell(cell, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_camera_that_sees_no_board_is_refused(cell, tmp_path):
+def test_camera_without_a_board_is_refused(cell, tmp_path):
+    """A camera that sees no board is refused."""
     with camera.limits_of(cell) as path:
         path.write_text(path.read_text().replace("tilt", "# tilt").replace("stands = {xyz = [0", "stands = {xyz = [9"))
         with pytest.raises(UsageError, match="sees the board at hardly any posture"):
@@ -82,7 +84,7 @@ def test_a_camera_that_sees_no_board_is_refused(cell, tmp_path):
             read_limits(path, targets_of(load("lwr4plus")))
 
 
-def test_a_camera_as_told_is_held_against_its_view_or_said_not_to_be(cell, tmp_path):
+def test_stated_camera_is_checked_or_said(cell, tmp_path):
     """A camera looks along its z, a board's z goes into it; what is unknown is named in what is unchecked."""
     arm = targets_of(cell.cell.nominal)
     with camera.limits_of(cell) as path:
@@ -119,7 +121,8 @@ def test_a_board_that_was_measured_is_kept(tmp_path):
     assert run(["board", "--out", str(tmp_path), "--overwrite"]) == 0 and path.read_bytes() != kept
 
 
-def test_boards_are_made_and_impossible_ones_refused(tmp_path, capsys):
+def test_boards_are_made_or_refused(tmp_path, capsys):
+    """Boards are made, and impossible ones refused."""
     given = ["--square", "25", "--columns", "7", "--rows", "5", "--paper", "A4"]
     assert run(["board", "--out", str(tmp_path), *given]) == 0
     made = read_board(tmp_path)
@@ -152,7 +155,8 @@ def shots(cell, q, seed, folder):
 
 
 @pytest.mark.slow
-def test_a_session_with_images_goes_to_its_certificate(cell, tmp_path):
+def test_session_with_images_reaches_its_end(cell, tmp_path):
+    """A session with images goes to its certificate."""
     with camera.limits_of(cell) as path:
         begin(tmp_path / "s", "lwr4plus", "camera", 30, 10, limits=path, dynamics=False)
     said: list[str] = []
@@ -176,7 +180,7 @@ def test_a_session_with_images_goes_to_its_certificate(cell, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_prediction_is_what_a_fit_then_states(cell):
+def test_prediction_is_sigma_of_a_fit(cell):
     """Sigma over the workspace from poses alone, against that of a fit of noisy images at them."""
     from calib.geometry.camera.camera_guess import complete_camera
     from calib.geometry.first_guess import install
@@ -202,7 +206,7 @@ def test_the_prediction_is_what_a_fit_then_states(cell):
 
 
 @pytest.mark.slow
-def test_images_beside_another_instrument_are_another_tool_and_their_coverage_is_drawn(cell, tmp_path):
+def test_images_are_a_tool_of_their_own(cell, tmp_path):
     """A tracker's reflector in the same hand, and distances of pairs of it; no option names the tools."""
     from calib.geometry.camera.camera_guess import complete_camera
     from calib.procedure.kinematic_stage.fit import run as fitted
@@ -239,7 +243,7 @@ def test_images_beside_another_instrument_are_another_tool_and_their_coverage_is
 
 @pytest.mark.slow
 @pytest.mark.parametrize("share, word", [(1.0, "pass"), (0.98, "marginal"), (1.02, "marginal")])
-def test_a_board_printed_too_large_or_too_small_is_no_pass(cell, share, word):
+def test_board_of_wrong_size_is_no_pass(cell, share, word):
     """A square that is off by less than its own check tells makes all fitted lengths grow by one factor."""
     from calib.procedure.kinematic_stage.fit import run as fitted
     from calib.procedure.kinematic_stage.inputs import gather

@@ -54,7 +54,8 @@ def limits(name: str, tmp_path, text: str = CELL, tools=((0.05, 0.0, 0.05),)) ->
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_every_candidate_is_seen_and_keeps_clear(name, tmp_path):
+def test_candidates_are_seen_and_keep_clear(name, tmp_path):
+    """Every candidate is seen, and keeps clear."""
     chain, found, seen = limits(name, tmp_path)
     space = found.space(seen)
     q = draw_candidates(space.lower, space.upper, 30, lambda x: is_feasible(space, x), seed=1)
@@ -63,7 +64,8 @@ def test_every_candidate_is_seen_and_keeps_clear(name, tmp_path):
     assert not is_feasible(space, random_joints(chain, 300)).all()
 
 
-def test_several_reflectors_let_more_poses_be_seen_and_only_seen_rows_count(tmp_path):
+def test_several_reflectors_show_more_poses(tmp_path):
+    """Several reflectors let more poses be seen, and only seen rows count."""
     sides = "[target]\nfacing = [[0, 0, 1], [1, 0, 0], [-1, 0, 0]]\n" + CELL
     tools = ((0.0, 0.0, 0.08), (0.08, 0.0, 0.05), (-0.08, 0.0, 0.05))
     chain, one, _ = limits("6 joints", tmp_path, tools=tools[:1])
@@ -121,7 +123,8 @@ def test_answers_that_cannot_be(answers, words):
         cell_tables(**answers)
 
 
-def test_a_selection_is_drawn_beside_its_poses_never_onto_what_is_read(tmp_path, capsys):
+def test_selection_is_drawn_beside_its_poses(tmp_path, capsys):
+    """A selection is drawn beside its poses, never onto what is read."""
     given = ["select", "lwr4plus", "-m", "12", "--candidates", "150", "--out"]
     assert run([*given, str(tmp_path / "a.csv")]) == 0
     written = {path.name for path in tmp_path.iterdir() if not path.name.startswith(".")}
@@ -134,7 +137,8 @@ def test_a_selection_is_drawn_beside_its_poses_never_onto_what_is_read(tmp_path,
     assert "written twice" in capsys.readouterr().err and not (tmp_path / "d.csv").exists()
 
 
-def test_what_is_unknown_is_named_and_what_is_not_there_is_not():
+def test_unknown_things_are_named():
+    """What is unknown is named, and what is not there is not."""
     cell = targets_of(load("ur5"))
     bare = limits_of(ConstraintsFile(), cell)
     touching = "collision of base with shoulder_lift_joint_link, elbow_joint_link with wrist_2_joint_link"
@@ -147,7 +151,8 @@ def test_what_is_unknown_is_named_and_what_is_not_there_is_not():
     assert (off.lower == cell.chain.lower).all() and (bare.lower > cell.chain.lower).all()
 
 
-def test_ways_keep_clear_and_their_order_takes_less_time(tmp_path):
+def test_ordered_ways_are_clear_and_faster(tmp_path):
+    """Ways keep clear, and their order takes less time."""
     wall = '[[obstacle]]\nname = "wall"\nkind = "box"\nsize = [1.0, 0.04, 1.0]\nxyz = [0.7, 0.0, 0.3]\n'
     chain, found, seen = limits("6 joints", tmp_path, wall)
     space = found.space(seen)
@@ -165,7 +170,7 @@ def test_ways_keep_clear_and_their_order_takes_less_time(tmp_path):
     assert np.abs(played[0] - q[run.order[0]]).max() < 1e-6 and np.abs(played[-1] - q[run.order[-1]]).max() < 1e-6
 
 
-def test_the_predicted_sigma_is_that_of_many_fits():
+def test_predicted_sigma_is_of_many_fits():
     """The tool's error after linear fits to noise, over typical poses, is as large as said."""
     chain = load("ur5")
     seen = observation(targets_of(chain, [(0.05, 0, 0.05)]), "position", (2e-5, 1e-4))
@@ -179,7 +184,8 @@ def test_the_predicted_sigma_is_that_of_many_fits():
     assert not np.isfinite(predicted(seen, seen(q[:5]), typical).rms)
 
 
-def test_a_selection_tells_run_prediction_and_what_seeing_costs(tmp_path):
+def test_selection_tells_run_and_prediction(tmp_path):
+    """A selection tells the run, the prediction and what seeing costs."""
     (tmp_path / "c.toml").write_text(CELL)
     wanted = calib.SelectionSettings("position", ((0.05, 0, 0.05),), candidates=100)
     chosen = calib.select_poses("lwr4plus", 14, wanted, constraints=tmp_path / "c.toml")
@@ -214,7 +220,8 @@ def test_a_cell_in_millimetres_is_refused(tmp_path, text, words):
         _limits(text, tmp_path)
 
 
-def test_what_never_acts_is_told_and_not_said_to_be_kept(tmp_path):
+def test_inactive_limits_are_told(tmp_path):
+    """A limit that never acts is told, and not said to be kept."""
     far, near = (_limits(BOX.format([1, 1, 1], [x, 0, 0]), tmp_path) for x in (50, 1.3))
     assert any("wall: 49.5 m" in note for note in far.notes) and not any("wall" in kept for kept in far.checked)
     assert not any("wall:" in note for note in near.notes) and any("wall" in kept for kept in near.checked)
@@ -244,7 +251,8 @@ def poses(count: int, seed: int, side: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("index", ["O1", pytest.param("O3", marks=pytest.mark.slow)])
-def test_poses_behind_a_wall_are_replaced_by_those_that_cost_least(index):
+def test_hidden_poses_are_replaced_cheaply(index):
+    """Poses behind a wall are replaced by those that cost least."""
     room, seen = walls(2.8), observation(targets_of(CHAIN))
     q = np.concatenate([poses(9, 1, 1.0), poses(2, 2, -1.0)])
     candidates = np.concatenate([poses(60, 3, 1.0), poses(60, 4, -1.0)])
@@ -260,7 +268,8 @@ def test_poses_behind_a_wall_are_replaced_by_those_that_cost_least(index):
     assert found.words.startswith(f"poses {named[0]}, {named[1]} replaced")
 
 
-def test_the_same_pose_on_another_turn_is_kept():
+def test_pose_on_another_turn_is_kept():
+    """The same pose on another turn is kept."""
     room, seen = walls(6.0), observation(targets_of(CHAIN))
     q = np.concatenate([poses(9, 1, 1.0), poses(2, 2, -1.0)])
     found = drivable(CHAIN, q, Exchange(seen, poses(60, 3, 1.0), None, "O1"), room, RunSettings())
@@ -276,14 +285,15 @@ def test_what_cannot_be_replaced_is_told():
     assert found.run.cut_off == (5,) and len(found.run.blocked) == 1 and not found.replaced
 
 
-def test_turns_are_the_same_posture_within_the_limits():
+def test_turns_are_one_posture_within_limits():
+    """Turns are the same posture within the limits."""
     top = np.array([6.2, 2.0, 2.0, 2.0, 2.0, 9.0])
     found = turns(CHAIN, np.full(6, 1.0), -top, top)
     assert len(found) == 2 * 3 and (np.abs(found) <= top).all()
     assert np.abs(np.sin((found - 1.0) / 2)).max() < 1e-12
 
 
-def test_ways_found_lead_by_third_poses_where_no_other_way_is_found(monkeypatch):
+def test_ways_lead_by_third_poses(monkeypatch):
     """Of a star only the middle is joined with each: the run comes back to it, and leaves nothing out."""
     room, q = walls(2.8), poses(5, 1, 1.0)
 

@@ -44,7 +44,8 @@ def arm(tmp_path):
     return path, urdf.read(path, tip="l4")
 
 
-def test_a_configurations_folder_limits_poses_and_motions(tmp_path, arm):
+def test_moveit_folder_limits_motions(tmp_path, arm):
+    """The folder of a MoveIt configuration limits poses and motions."""
     path, chain = arm
     found = read_limits(tmp_path, targets_of(chain), path, ["joint-margin"])
     assert np.allclose(found.lower, [-np.pi / 2, -3, -3, -3]) and np.allclose(found.upper, [1.5, 3, 3, 3])
@@ -70,7 +71,8 @@ def test_a_configurations_folder_limits_poses_and_motions(tmp_path, arm):
         ("arm.srdf", "</robot>", "", r"arm\.srdf.*line 2"),
     ],
 )
-def test_what_cannot_be_or_is_another_robots_is_refused(tmp_path, arm, file, old, new, says):
+def test_foreign_configuration_is_refused(tmp_path, arm, file, old, new, says):
+    """A configuration that cannot be, or is another robot's, is refused."""
     path, chain = arm
     place = tmp_path / "config" / file
     place.write_text(place.read_text().replace(old, new))
@@ -78,7 +80,8 @@ def test_what_cannot_be_or_is_another_robots_is_refused(tmp_path, arm, file, old
         read_motion_limits(place, chain, path)
 
 
-def test_a_folder_without_them_is_refused_and_so_is_a_link_that_is_none(tmp_path, arm):
+def test_unrelated_folder_or_link_is_refused(tmp_path, arm):
+    """A folder without limits is refused, and so is a link that is none."""
     path, chain = arm
     (tmp_path / "empty").mkdir()
     with pytest.raises(UsageError, match=r"empty: neither joint_limits\.yaml nor \*\.srdf"):
@@ -87,7 +90,8 @@ def test_a_folder_without_them_is_refused_and_so_is_a_link_that_is_none(tmp_path
         read_limits({"collision": {"ignored": [["foto", "l4"]]}}, targets_of(chain), path)
 
 
-def test_pairs_of_an_arm_without_shapes_are_those_of_its_capsules(tmp_path, arm):
+def test_pairs_without_shapes_use_capsules(tmp_path, arm):
+    """Pairs of an arm without shapes are those of its capsules."""
     _, chain = arm
     pair = ("foot", "l3")
     found = read_limits({"collision": {"ignored": [pair]}}, targets_of(chain))

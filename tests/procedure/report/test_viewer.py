@@ -77,7 +77,8 @@ def constant(path: Path) -> set[str]:
     return {chunk.entity_path for chunk in chunks.RrdReader(str(path)).store().stream() if chunk.is_static}
 
 
-def test_a_fit_shows_every_pose_as_both_arms_see_it(fitted, tmp_path):
+def test_fit_shows_poses_of_both_arms(fitted, tmp_path):
+    """A fit shows every pose as both arms see it."""
     pytest.importorskip("rerun")
     scene = viewer.write(fitted, tmp_path / "a.rrd")
     measured = scene.measured[0]
@@ -93,7 +94,8 @@ def test_a_fit_shows_every_pose_as_both_arms_see_it(fitted, tmp_path):
     assert "45 fitted poses: " in viewer.about(scene) and "15 unseen poses: " in viewer.about(scene)
 
 
-def test_the_arrows_are_the_errors_that_the_fit_reports(fitted):
+def test_arrows_are_the_reported_errors(fitted):
+    """The arrows are the errors that the fit reports."""
     measured = viewing.read(fitted).measured[0]
     with (fitted / "residuals.csv").open(newline="") as file:
         table = list(csv.DictReader(file))
@@ -107,7 +109,8 @@ def test_the_arrows_are_the_errors_that_the_fit_reports(fitted):
     assert np.abs(at - measured.calibrated).max() < 1e-9  # in the base of the arm that is drawn
 
 
-def test_a_session_plays_poses_motions_and_torques_on_one_clock(session, tmp_path):
+def test_session_plays_on_one_clock(session, tmp_path):
+    """A session plays poses, motions and torques on one clock."""
     chunks = pytest.importorskip("rerun.chunk")
     scene = viewer.write(session, tmp_path / "s.rrd")
     found = rows(tmp_path / "s.rrd")
@@ -131,7 +134,8 @@ def test_a_session_plays_poses_motions_and_torques_on_one_clock(session, tmp_pat
     assert all(before[1] < after[0] for before, after in pairwise(order))
 
 
-def test_links_are_meshes_where_their_files_are_found(session, tmp_path):
+def test_links_are_meshes_where_files_exist(session, tmp_path):
+    """Links are meshes where their files are found."""
     pytest.importorskip("rerun")
     mesh = tmp_path / "arm_description" / "meshes" / "a.stl"
     mesh.parent.mkdir(parents=True)
@@ -154,7 +158,8 @@ def test_links_are_meshes_where_their_files_are_found(session, tmp_path):
     assert any("b.stl" in note for note in scene.notes)
 
 
-def test_without_rerun_the_command_says_what_to_install_and_a_session_goes_on(fitted, monkeypatch, capsys, tmp_path):
+def test_missing_rerun_is_said(fitted, monkeypatch, capsys, tmp_path):
+    """Without Rerun the command says what to install, and a session goes on."""
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert cli.run(["view", str(fitted), "--save", str(tmp_path / "x.rrd")]) == 2
     assert "pip install rerun-sdk" in capsys.readouterr().err
@@ -162,7 +167,9 @@ def test_without_rerun_the_command_says_what_to_install_and_a_session_goes_on(fi
     assert "not installed" in viewer.write_beside(fitted)
 
 
-def test_a_recording_that_fails_stops_nothing(fitted, monkeypatch):
+def test_failing_recording_stops_nothing(fitted, monkeypatch):
+    """A recording that fails stops nothing."""
+
     def broken(*arguments: object) -> None:
         raise RuntimeError("no room")
 
@@ -170,7 +177,8 @@ def test_a_recording_that_fails_stops_nothing(fitted, monkeypatch):
     assert viewer.write_beside(fitted) == "no session.rrd: no room"
 
 
-def test_folders_that_show_nothing_are_refused(tmp_path):
+def test_empty_folders_are_refused(tmp_path):
+    """Folders that show nothing are refused."""
     with pytest.raises(UsageError, match="contains no result; give a folder with measured poses"):
         viewing.read(tmp_path)
     with pytest.raises(UsageError, match="neither folder nor CSV"):
@@ -178,7 +186,8 @@ def test_folders_that_show_nothing_are_refused(tmp_path):
     assert cli.run(["view", str(tmp_path), "--no-spawn"]) == 2
 
 
-def test_a_motion_alone_needs_to_be_told_its_robot(session):
+def test_motion_alone_needs_its_robot(session):
+    """A motion alone needs to be told its robot."""
     folder = session / "6-excitation" / "training"
     assert "--robot" in viewing.read(folder).notes[-1]
     scene = viewing.read(folder, "ur5")

@@ -35,20 +35,23 @@ def test_drift_is_told_from_noise(seed: int) -> None:
     assert [repeated(size, seed)[0].code for size in (0.0, 1e-3)] == ["poses-repeat", "poses-moved"]
 
 
-def test_a_pose_measured_twice_in_one_file_counts() -> None:
+def test_pose_repeated_in_one_file_counts() -> None:
+    """A pose measured twice in one file counts."""
     found = measure(CELL, np.concatenate([Q, Q[:3]]), 1)
     (repeats,) = drift.repeats(CELL.nominal, [found], [], 60e-6)
     assert (repeats.code, repeats.values["poses"], repeats.values["when"]) == ("poses-repeat", 3, "more than once")
     assert drift.repeats(CELL.nominal, [take(found, range(20))], [], 60e-6) == []
 
 
-def test_commanded_joints_in_place_of_read_ones_are_noticed() -> None:
+def test_commanded_joints_are_noticed() -> None:
+    """Commanded joints in place of read ones are noticed."""
     found = measure(CELL, Q, 1)
     assert readback(Q, found)[0].values["rms"] == pytest.approx(9.1e-6, rel=0.01)
     assert readback(Q, replace(found, q=Q))[0].code == "readback-copied"
 
 
-def test_a_recording_named_after_a_payload_carries_it(tmp_path) -> None:
+def test_recording_name_states_its_payload(tmp_path) -> None:
+    """A recording named after a payload carries it."""
     session = begin(tmp_path / "cell", "lwr4plus", "cmm", 5, 0, payloads={"loaded": 3.28}, torques="both")
     for name in ("training.csv", "training_loaded.csv"):
         session.path(f"7-recorded/{name}").write_text("t\n")
@@ -69,12 +72,13 @@ def test_answers_are_checked_as_they_come() -> None:
     given = with_answer(with_answer(given, ask["payloads"], "loaded=3.28"), ask["dynamics"], "yes")
     assert not ask["payloads"].open(given) and ask["torques"].open(given)
     found = checked(with_answer(given, ask["torques"], "both"))
-    assert found["payloads"] == {"loaded": 3.28} and found["tool"] == (0.05, 0.0, 0.05) and found["dynamics"]
+    assert found["payloads"] == {"loaded": {"mass": 3.28}} and found["tool"] == (0.05, 0.0, 0.05) and found["dynamics"]
     with pytest.raises(UsageError, match="geometry-only"):
         checked(Answers("ur5", "cmm", dynamics=False, torques="both"))
 
 
-def test_metres_under_a_header_of_millimetres_are_refused_in_validation_files_too(measured: Session) -> None:
+def test_wrong_unit_of_validation_is_refused(measured: Session) -> None:
+    """Metres under a header of millimetres are refused in validation files, too."""
     path = measured.path("3-measured/validation_measured.csv")
     head, *lines = path.read_text().strip().split("\n")
     columns = [k for k, name in enumerate(head.split(",")) if name in ("x [mm]", "y [mm]", "z [mm]")]
@@ -86,7 +90,7 @@ def test_metres_under_a_header_of_millimetres_are_refused_in_validation_files_to
         read_measured(measured, chain_of(measured), [path])
 
 
-def test_a_camera_is_asked_for_its_own_place_and_not_for_a_reflectors():
+def test_camera_is_asked_for_its_own_place():
     """Where a tracker is asked for target, place and cone, a camera is asked what the arm carries, and for files."""
     asked = {}
     for instrument in ("tracker", "camera"):

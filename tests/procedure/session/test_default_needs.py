@@ -32,7 +32,8 @@ FINE = "ZZ1R,kg m²,1.0,0.05,5.0,0.04\n"
 WEAK = "MX2,kg m,1.0,0.4,40.0,0.3\nFv1,N m s/rad,1.0,0.15,15.0,0.1\n"
 
 
-def test_joints_and_parameters_above_ten_percent_are_named_the_worst_first(tmp_path: Path) -> None:
+def test_worst_above_ten_percent_come_first(tmp_path: Path) -> None:
+    """Joints and parameters above ten percent are named, the worst first."""
     unseen = "off3,N m,1.0,9.0,900.0,\nFs2,N m,1.0,0.5,50.0,0.4\n"  # not essential; no motion can be designed for it
     (line,) = promised(session(tmp_path, [3.0, 25.0, 4.0, 3.0, 3.0, 12.0], FINE + WEAK + unseen))
     assert line.startswith(
@@ -43,7 +44,8 @@ def test_joints_and_parameters_above_ten_percent_are_named_the_worst_first(tmp_p
     assert line.endswith(f"calib next {tmp_path}")
 
 
-def test_one_key_is_named_where_only_one_kind_falls_short(tmp_path: Path) -> None:
+def test_lone_shortfall_names_one_key(tmp_path: Path) -> None:
+    """One key is named where only one kind falls short."""
     (line,) = promised(session(tmp_path, [3.0] * 6, WEAK))
     assert "sigma_percent = 10 under" in line and "tolerance" not in line and "torque of" not in line
 

@@ -27,7 +27,8 @@ def errors(out: Path) -> dict[str, float]:
 
 
 @pytest.mark.slow
-def test_both_halves_pass_and_the_console_is_short(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_both_halves_pass_with_short_console(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Both halves pass, and the console is short."""
     out = tmp_path / "d"
     assert run("demo", "--out", out) == 0
     said = capsys.readouterr().out.splitlines()
@@ -44,7 +45,8 @@ def test_both_halves_pass_and_the_console_is_short(tmp_path: Path, capsys: pytes
 
 
 @pytest.mark.slow
-def test_the_hard_arm_says_what_marginal_means(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_hard_arm_says_what_marginal_means(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """The hard arm says what marginal means."""
     out = tmp_path / "d"
     assert run("demo", "--hard", "--geometry-only", "--out", out) == 0
     said = capsys.readouterr().out
@@ -80,7 +82,8 @@ def test_hard_names_the_robot(tmp_path: Path, capsys: pytest.CaptureFixture) -> 
     assert "--hard both name a robot" in capsys.readouterr().err
 
 
-def test_progress_tells_stage_share_and_time_left() -> None:
+def test_progress_tells_stage_and_time() -> None:
+    """Progress tells stage, share and time left."""
     shown: list[str] = []
     session: Any = SimpleNamespace(geometric=True, dynamic=True, needs=False)
     told = Telling(session, print, shown.append)
@@ -93,5 +96,6 @@ def test_progress_tells_stage_share_and_time_left() -> None:
     assert set(SECONDS) < {step.name for step in steps.steps_of(session)}
 
 
-def test_only_arms_with_torque_sensors_log_them() -> None:
+def test_only_torque_sensor_arms_log_torques() -> None:
+    """Only arms with torque sensors log them."""
     assert [sensed(robot) for robot in ("lwr4plus", "tx40", "ur10e")] == [True, False, False]

@@ -38,7 +38,8 @@ def measured(cell, folder, moves, seed=2, columns=("time [min]",), start=0.0):
     return path
 
 
-def test_a_planted_drift_is_found_with_its_slope(cell, tmp_path):
+def test_planted_drift_is_found_with_slope(cell, tmp_path):
+    """A planted drift is found with its slope."""
     path = measured(cell, tmp_path, MOVES, columns=("time [min]", "temp_air"))
     found = drift_page.drift("ur5", [path], DriftSettings(sigma=6e-5))
     time, warmth = found.trends
@@ -48,7 +49,8 @@ def test_a_planted_drift_is_found_with_its_slope(cell, tmp_path):
     assert {each.code for each in found.noticed} == {"target-drifts", "poses-moved"}
 
 
-def test_a_drift_within_the_tolerance_is_a_note(cell, tmp_path):
+def test_drift_within_tolerance_is_a_note(cell, tmp_path):
+    """A drift within the tolerance is a note."""
     path = measured(cell, tmp_path, MOVES)
     found = drift_page.drift("ur5", [path], DriftSettings(sigma=6e-5, tolerance=1e-3))
     assert [level_of(one) for one in found.noticed if one.code == "target-drifts"] == ["note"]
@@ -63,7 +65,8 @@ def test_noise_is_no_drift(cell, tmp_path, seed):
     ].sigma
 
 
-def test_a_time_that_starts_anew_in_each_file_is_no_clock(cell, tmp_path):
+def test_time_starting_anew_is_no_clock(cell, tmp_path):
+    """A time that starts anew in each file is no clock."""
     first = measured(cell, tmp_path, MOVES)
     late, restarted = (measured(cell, tmp_path, MOVES, start=start) for start in (60.0, 1.0))
     assert drift_page.drift("ur5", [first, late]).trends
@@ -82,7 +85,8 @@ def test_dates_are_times(cell, tmp_path):
     assert found.span == pytest.approx(HOURS, rel=1e-3)
 
 
-def test_without_repeated_poses_nothing_is_said(cell, tmp_path):
+def test_drift_needs_repeated_poses(cell, tmp_path):
+    """Without repeated poses nothing is said."""
     q = np.random.default_rng(0).uniform(-2.0, 2.0, (20, 6))
     path = write_measured(measure(cell, q, seed=1), tmp_path / "once.csv")
     with pytest.raises(UsageError, match="no pose was measured twice"):
@@ -91,7 +95,8 @@ def test_without_repeated_poses_nothing_is_said(cell, tmp_path):
     assert trends(cell.nominal, [replace(block, file="none.csv")]) == []
 
 
-def test_the_command_writes_page_table_and_figure(cell, tmp_path, capsys):
+def test_command_writes_page_table_figure(cell, tmp_path, capsys):
+    """The command writes page, table and figure."""
     path = measured(cell, tmp_path, MOVES)
     assert cli.run(["drift", "ur5", str(path), "--sigma", "0.06", "--out", str(tmp_path / "out")]) == 0
     assert "the target drifts with time by" in capsys.readouterr().out

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from pypdf import PdfReader
 from sessions import begin, copy_of, edit, go_on, kinds
+from without_figures import run
 
 from calib import cli
 from calib.apps.cell_demo import demo
@@ -18,6 +19,7 @@ from calib.data.csv_table import read_header
 from calib.data.recordings.recording_files import read_recording
 from calib.errors import MeasurementError
 from calib.identification.model_file import read_dynamics
+from calib.procedure.excitation import stored_front
 from calib.procedure.robot_kinds import joints_of
 from calib.procedure.session import commands, steps
 from calib.procedure.session.dynamics_steps import check_motion, designed_motions
@@ -72,7 +74,7 @@ PLAIN = re.compile(  # columns that have no unit, or have it in a column of thei
 
 
 @pytest.mark.slow
-def test_no_column_of_a_session_lacks_its_unit(whole: Session) -> None:
+def test_session_columns_have_units(whole: Session) -> None:
     """Joints above all: those of what is to be driven, of what was, of motions and of torques."""
     seen = 0
     for path in sorted(whole.folder.rglob("*.csv")):
@@ -85,7 +87,8 @@ def test_no_column_of_a_session_lacks_its_unit(whole: Session) -> None:
     assert seen > 100 and not list(whole.folder.glob("*/validation.csv"))
 
 
-def test_dynamics_asked_for_afterwards_keep_the_geometry(waiting: Session) -> None:
+def test_later_dynamics_keep_the_geometry(waiting: Session) -> None:
+    """Dynamics asked for afterwards keep the geometry."""
     found = kinds(waiting)
     assert [name for name, kind in found.items() if kind == steps.DONE] == [
         "describe", "select", "measure", "fit", "validate", "excite",
@@ -93,7 +96,8 @@ def test_dynamics_asked_for_afterwards_keep_the_geometry(waiting: Session) -> No
     assert not waiting.path("6-export").exists() and waiting.path("9-export/robot.urdf").exists()
 
 
-def test_two_lines_say_what_to_play_and_what_to_log(waiting: Session) -> None:
+def test_two_lines_say_what_to_play_and_log(waiting: Session) -> None:
+    """Two lines say what to play and what to log."""
     state = next(state for state in steps.states(waiting) if state.kind == steps.WAITING)
     first, second = commands.asks(waiting, state)
     assert "6-excitation/training/run.csv" in first and "validation/run.csv" in first
@@ -101,7 +105,8 @@ def test_two_lines_say_what_to_play_and_what_to_log(waiting: Session) -> None:
     assert "7-recorded/training_log.csv" in second and "q_joint1 [deg]" in second and "tau_joint7 [Nm]" in second
 
 
-def test_without_a_plan_no_motion_is_designed_or_presented(waiting: Session) -> None:
+def test_no_plan_means_no_designed_motion(waiting: Session) -> None:
+    """Without a plan no motion is designed or presented."""
     shutil.rmtree(waiting.path("6-excitation"))
     head, dynamics = waiting.path("session.toml").read_text().split("[dynamics]\n")
     assert dynamics.count("plan = true ") == 1
@@ -113,7 +118,8 @@ def test_without_a_plan_no_motion_is_designed_or_presented(waiting: Session) -> 
     assert "a different one for validation" in commands.asks(session, stopped)[0]
 
 
-def test_a_motion_that_was_recorded_stays_when_the_geometry_is_fitted_again(waiting: Session) -> None:
+def test_recorded_motion_survives_a_refit(waiting: Session) -> None:
+    """A motion that was recorded stays when the geometry is fitted again."""
     for brought, kept in ((False, False), (True, True)):
         if brought:
             waiting.path("7-recorded").mkdir(exist_ok=True)
@@ -147,7 +153,8 @@ def test_it_ends_in_one_certificate_of_both(whole: Session) -> None:
 
 
 @pytest.mark.slow
-def test_the_unexplained_share_is_the_error_against_the_hidden_arm(whole: Session) -> None:
+def test_unexplained_share_is_the_true_error(whole: Session) -> None:
+    """The unexplained share is the error against the hidden arm."""
     # The truth holds friction with memory, warming gears, cables: what the certificate says of unseen motion (filtered,
     # with noise) is what it is without noise on yet another motion.
     cell = virtual_cell("lwr4plus", 1)
@@ -252,7 +259,8 @@ def test_a_wrong_recording_is_said(recorded: Session, change: Callable[[str], st
     assert kinds(recorded)["excite"] == steps.DONE and not recorded.path("8-dynamics/dynamics.json").exists()
 
 
-def test_a_motion_played_too_seldom_and_loosely_is_noted(recorded: Session) -> None:
+def test_loose_or_rare_playback_is_noted(recorded: Session) -> None:
+    """A motion played too seldom and loosely is noted."""
     path, motion = recorded.path("7-recorded/training_log.csv"), designed_motions(recorded)["training"]
     log = read_recording(str(path), joints_of(load_calibrated(recorded.fit.path).chain))
     loose = replace(log, q=log.q + 0.3 * log.q.std(axis=0) * np.sin(40.0 * log.t)[:, None])
@@ -260,21 +268,24 @@ def test_a_motion_played_too_seldom_and_loosely_is_noted(recorded: Session) -> N
     assert found.periods == 2 and [one.code for one in noted] == ["repetitions-missing", "tracking-loose"]
 
 
-def test_the_validation_motion_is_not_learnt_from_and_the_training_motion_no_proof(recorded: Session) -> None:
+def test_training_and_validation_stay_apart(recorded: Session) -> None:
+    """The validation motion is not learnt from, and the training motion is no proof."""
     one, two = recorded.path("7-recorded/training_log.csv"), recorded.path("7-recorded/validation_log.csv")
     shutil.copyfile(two, one)
     with pytest.raises(MeasurementError, match="contains the validation motion instead"):
         go_on(recorded)
 
 
-def test_recordings_keep_the_plan_they_were_made_to(recorded: Session) -> None:
+def test_recordings_keep_their_plan(recorded: Session) -> None:
+    """Recordings keep the plan that they were made to."""
     before = recorded.path("6-excitation/training/trajectory.csv").read_text()
     edit(recorded.path("session.toml"), "harmonics = 5", "harmonics = 4")
     assert kinds(recorded)["excite"] == steps.KEPT
     assert recorded.path("6-excitation/training/trajectory.csv").read_text() == before
 
 
-def test_a_guided_demonstration_stops_where_an_engineer_would(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_guided_demo_stops_for_an_engineer(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """A guided demonstration stops where an engineer would."""
     out = str(tmp_path / "cell")
     assert cli.run(["demo", "--guided", "--geometry-only", "--no-plots", "--out", out]) == 0
     said = capsys.readouterr().out.replace("\n", "")
@@ -285,6 +296,28 @@ def test_a_guided_demonstration_stops_where_an_engineer_would(tmp_path: Path, ca
     assert cli.run(["demo", "--bring", out]) == 2 and "waits for no files" in capsys.readouterr().err
 
 
-def test_a_robot_without_masses_is_calibrated_without_dynamics(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_massless_robot_gets_no_dynamics(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """A robot without masses is calibrated without dynamics."""
     session = begin(tmp_path / "cell", "ur5", "cmm", 5, 0, dynamics=False)
     assert not session.dynamic and not session.path("7-recorded").exists()
+
+
+def test_front_motion_is_picked_before_recording(waiting: Session, capsys: pytest.CaptureFixture) -> None:
+    """A picked motion becomes the training motion, its step stays done; recorded motions are not exchanged."""
+    path = waiting.path("session.toml")
+    edit(path, "goals = []", 'goals = ["wrist=0.5"]')
+    edit(path, "front = 0", "front = 3")
+    capsys.readouterr()
+    assert run("next", waiting.folder) == 0
+    words = " ".join(capsys.readouterr().out.split())
+    assert "goal wrist=0.5 is missed" in words and "motions to choose from" in words
+    front = stored_front.read(waiting.path("6-excitation/training"))
+    number = 2 if front.values.designed == 0 else 1
+    assert run("next", waiting.folder, "--pick", number) == 0
+    assert stored_front.read(waiting.path("6-excitation/training")).values.designed == number - 1
+    assert kinds(waiting)["excite"] == steps.DONE
+    capsys.readouterr()
+    waiting.path("7-recorded").mkdir(exist_ok=True)
+    waiting.path("7-recorded/training_log.csv").write_text("t\n")
+    assert run("next", waiting.folder, "--pick", 1) == 2
+    assert "already recorded" in capsys.readouterr().err

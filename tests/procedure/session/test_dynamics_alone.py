@@ -45,7 +45,8 @@ def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
     return recorded(tmp_path_factory.mktemp("alone"), "tau")
 
 
-def test_it_ends_in_a_certificate_and_says_how_well_the_exported_robot_predicts(session: Session) -> None:
+def test_certificate_judges_exported_robot(session: Session) -> None:
+    """A session of dynamics alone ends in a certificate, and says how well the exported robot predicts."""
     assert [state.step.name for state in steps.states(session)] == [
         "describe", "excite", "record", "identify", "predict", "export", "certificate",
     ]  # fmt: skip
@@ -69,7 +70,8 @@ def test_it_ends_in_a_certificate_and_says_how_well_the_exported_robot_predicts(
     assert f"leaves {said:.2f} %" in session.path("9-export/README.txt").read_text()
 
 
-def test_torques_in_amperes_are_good_for_prediction_only(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_ampere_torques_only_predict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Torques in amperes are good for prediction only."""
     session = recorded(tmp_path, "i")
     whole = json.loads(session.path("verdict.json").read_text())
     assert whole["verdict"] == PREDICTION_ONLY and "scaled to joint" in whole["dynamics"]["reason"]
@@ -78,7 +80,8 @@ def test_torques_in_amperes_are_good_for_prediction_only(tmp_path: Path, capsys:
     assert run("next", session.folder) == 0 and "no robot was exported" in capsys.readouterr().out
 
 
-def test_no_file_says_another_verdict_than_that_of_what_is_delivered(session: Session) -> None:
+def test_files_say_the_delivered_verdict(session: Session) -> None:
+    """No file says another verdict than that of what is delivered."""
     for tolerance, exports, verdict, why in (
         (1e-6, True, "fail", "the exported robot has an error"), (0.0, False, PREDICTION_ONLY, "no such robot"),
     ):  # fmt: skip

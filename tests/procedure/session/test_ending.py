@@ -25,7 +25,8 @@ from calib.procedure.session import commands
         ("urdf", [], "fail", "no robot was exported"),
     ],
 )
-def test_the_last_line_names_the_judged_robot(tmp_path: Path, monkeypatch, deliverable, files, level, ending):
+def test_last_line_names_the_judged_robot(tmp_path: Path, monkeypatch, deliverable, files, level, ending):
+    """The last line names the judged robot."""
     (tmp_path / "6-export").mkdir()
     for name in files:
         (tmp_path / "6-export" / name).touch()

@@ -41,7 +41,7 @@ def test_one_that_fails_stops_none(cells: Path, capsys: pytest.CaptureFixture) -
     assert run("run", cells / "a", cells / "a/session.toml") == 2
 
 
-def test_a_session_that_another_command_works_on_is_busy(cells: Path, capsys: pytest.CaptureFixture) -> None:
+def test_session_in_use_is_busy(cells: Path, capsys: pytest.CaptureFixture) -> None:
     """It has not failed, and its log is left to that command."""
     with locked(open_session(cells / "c"), lambda words: None):
         assert run("run", cells / "a", cells / "c") == 2
@@ -56,7 +56,8 @@ def test_a_failing_verdict_is_code_1(cells: Path) -> None:
     assert [one.code for one in fleet.run_sessions([cells / "a", cells / "c"], command="test")] == [1, 0]
 
 
-def test_an_unforeseen_error_stops_none_either(cells: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unforeseen_error_stops_no_session(cells: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An unforeseen error stops no session, either."""
     monkeypatch.setattr(steps, "run_next", lambda *given: 1 / 0)
     one = fleet.run_session(cells / "a")
     assert one.state == fleet.FAILED and one.code == 4 and "ZeroDivisionError" in one.words
@@ -65,7 +66,9 @@ def test_an_unforeseen_error_stops_none_either(cells: Path, monkeypatch: pytest.
     assert not (cells / "a/session.lock").exists()
 
 
-def test_a_robot_whose_process_dies_is_one_that_failed(cells: Path) -> None:
+def test_robot_of_a_dead_process_has_failed(cells: Path) -> None:
+    """A robot whose process dies is one that failed."""
+
     def stream(function: Callable, tasks: Iterable[tuple], near: Callable[[int], bool]) -> Generator:
         _, given = tasks
         yield 1, function(*given), None

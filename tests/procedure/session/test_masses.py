@@ -49,14 +49,16 @@ def identified(tmp_path_factory) -> Path:
     return calib.identify_dynamics(robot, log, settings).save(folder / "out", plots=False)
 
 
-def test_identified_masses_have_the_true_gravity_torques(identified):
+def test_masses_have_true_gravity_torques(identified):
+    """Identified masses have the true gravity torques."""
     q = np.random.default_rng(0).uniform(-2.0, 2.0, (50, planted.N))
     own = replace(planted.arm(), inertias=identified_masses(identified, planted.arm()))
     found, true, wrong = (gravity_torques(arm, q) for arm in (own, planted.arm(), believed()))
     assert np.abs(found - true).max() < 0.05 < 1.0 < np.abs(wrong - true).max()
 
 
-def test_compliance_is_right_with_identified_masses_and_wrong_with_those_of_the_data_sheet(identified, tmp_path):
+def test_identified_masses_fix_compliance(identified, tmp_path):
+    """Compliance is right with identified masses, and wrong with those of the data sheet."""
     poses = measured(1, 50)
     for masses, limits in (("", (0.15, 1.0)), (str(identified), (0.0, 0.01))):
         found = calib.fit_geometry(
@@ -73,7 +75,8 @@ def test_compliance_is_right_with_identified_masses_and_wrong_with_those_of_the_
     assert np.sqrt(read.corrections.covariance[own, own]) == pytest.approx(sigma, rel=1e-9)
 
 
-def test_masses_of_another_arm_or_of_no_folder_are_refused(identified, tmp_path):
+def test_masses_of_another_arm_are_refused(identified, tmp_path):
+    """Masses of another arm or of no folder are refused."""
     with pytest.raises(UsageError, match="has 7"):
         identified_masses(identified, calib.load("lwr4plus").chain)
     with pytest.raises(Exception, match="identif"):
@@ -82,7 +85,8 @@ def test_masses_of_another_arm_or_of_no_folder_are_refused(identified, tmp_path)
 
 
 @pytest.mark.slow
-def test_a_session_returns_masses_until_nothing_moves(tmp_path):
+def test_masses_return_until_nothing_moves(tmp_path):
+    """A session returns masses until nothing moves."""
     robot = description.write(tmp_path / "arm.toml", believed())
     session = new_session(tmp_path / "s", robot, "other-pose", friction="standard", plan=False)
     text = (session / "session.toml").read_text()

@@ -26,7 +26,8 @@ def cell(tmp_path: Path) -> Path:
     return tmp_path / "cell"
 
 
-def test_an_older_session_stands_where_it_stood_and_goes_on(cell: Path) -> None:
+def test_older_session_goes_on(cell: Path) -> None:
+    """An older session stands where it stood, and goes on."""
     standing = kinds(open_session(cell))
     assert set(list(standing.values())[:-2]) == {steps.DONE}, "nothing is made again"
     assert list(standing)[-2:] == ["export", "certificate"]
@@ -54,7 +55,8 @@ def _redone(cell: Path, name: str) -> Session:
     return session
 
 
-def test_validating_an_older_fit_again_gives_its_verdict_and_figures(cell: Path) -> None:
+def test_older_fit_validates_to_its_verdict(cell: Path) -> None:
+    """Validating an older fit again gives its verdict and figures."""
     old = json.loads((cell / "5-validation/metrics.json").read_text())
     _redone(cell, "validate")
     new = json.loads((cell / "5-validation/metrics.json").read_text())
@@ -63,7 +65,8 @@ def test_validating_an_older_fit_again_gives_its_verdict_and_figures(cell: Path)
     same(errors, _narrowed(new["validation"]["validation.csv"], errors))
 
 
-def test_an_older_fit_is_exported_and_compensates_as_it_did(cell: Path, tmp_path: Path) -> None:
+def test_older_fit_exports_and_compensates(cell: Path, tmp_path: Path) -> None:
+    """An older fit is exported, and compensates as it did."""
     assert not run("export", cell / "4-fit", "--offsets", tmp_path / "joint_offsets.csv")
     assert (tmp_path / "joint_offsets.csv").read_bytes() == (EXPECTED / "joint_offsets.csv").read_bytes()
     where = ("--tool", "0.3,0.05,0.02", "--dof", 3, "--tolerance", "2,100")
@@ -73,7 +76,8 @@ def test_an_older_fit_is_exported_and_compensates_as_it_did(cell: Path, tmp_path
         np.testing.assert_allclose(now, then, 1e-6)
 
 
-def test_dynamics_identified_on_an_older_fit_are_those_it_gave(cell: Path, tmp_path: Path) -> None:
+def test_dynamics_on_an_older_fit_stay(cell: Path, tmp_path: Path) -> None:
+    """Dynamics identified on an older fit are those it gave."""
     logs = cell / "7-recorded"
     found, old = tmp_path / "model", json.loads((EXPECTED / "identified.json").read_text())
     plain = tmp_path / "options.toml"

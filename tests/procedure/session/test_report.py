@@ -75,7 +75,8 @@ def test_it_says_what_a_professional_signs(text: str, finished_folder: Path) -> 
     assert len(digest) == len(set(digest)) >= 6
 
 
-def test_a_simulated_session_says_that_it_is_and_another_does_not(page: str, first: str, finished: Session) -> None:
+def test_simulated_session_alone_says_it_is(page: str, first: str, finished: Session) -> None:
+    """A simulated session says that it is, and another does not."""
     assert (
         all(">Simulated calibration of" in one for one in (page, first))
         and "SIMULATED: nothing was measured on a robot; optical CMM" in page
@@ -86,7 +87,8 @@ def test_a_simulated_session_says_that_it_is_and_another_does_not(page: str, fir
     assert all("imulated" not in finished.path(name).read_text() for name in ("certificate.html", "report.html"))
 
 
-def test_the_certificate_states_the_numbers_of_the_data_on_four_pages(finished: Session) -> None:
+def test_certificate_states_the_numbers(finished: Session) -> None:
+    """The certificate states the numbers of the data on four pages."""
     edit(finished.path("session.toml"), 'robot_serial = ""', 'robot_serial = "SN 4711"')
     edit(finished.path("session.toml"), "tolerance_mm = 0.0", "tolerance_mm = 0.3")
     assert go_on(finished, plots=True) is None
@@ -111,7 +113,8 @@ def test_the_certificate_states_the_numbers_of_the_data_on_four_pages(finished: 
     assert shown.count("data:image/svg+xml;base64,") == 3
 
 
-def test_what_was_noticed_on_arrival_stands_on_it(text: str, finished_folder: Path) -> None:
+def test_arrival_notes_stand_on_certificate(text: str, finished_folder: Path) -> None:
+    """What was noticed on arrival stands on the certificate."""
     lines = (finished_folder / "3-measured/checked.txt").read_text().splitlines()
     assert "Notes on the files when they were read" in text
     assert all(line in text for line in lines) and any(re.match("drift.csv: .* measured again", line) for line in lines)
@@ -120,13 +123,15 @@ def test_what_was_noticed_on_arrival_stands_on_it(text: str, finished_folder: Pa
     assert all(f"{name}.csv: measured joint positions differ" in text for name in ("validation_measured", "measured"))
 
 
-def test_every_figure_is_in_the_page_and_says_what_it_shows(page: str) -> None:
+def test_page_holds_and_explains_all_figures(page: str) -> None:
+    """Every figure is in the page, and says what it shows."""
     figures = re.findall(r'<img [^>]*alt="([^"]+)" src="data:image/png;base64,([^"]+)">', page)
     assert len(figures) >= 7 and len(set(figures)) == len(figures)
     assert all(base64.b64decode(data)[:4] == b"\x89PNG" for _, data in figures)
 
 
-def test_numbers_of_the_report_are_those_of_the_fit(finished_folder: Path) -> None:
+def test_report_numbers_are_those_of_the_fit(finished_folder: Path) -> None:
+    """Numbers of the report are those of the fit."""
     found = fit_report.read(finished_folder / "4-fit/report.json")
     metrics = json.loads((finished_folder / "4-fit/metrics.json").read_text())
     errors = 1e3 * np.array(found.sets[0].calibrated["position"])
@@ -135,7 +140,8 @@ def test_numbers_of_the_report_are_those_of_the_fit(finished_folder: Path) -> No
     assert found.noise["position"] == pytest.approx(60e-6 * np.sqrt(3))
 
 
-def test_a_fits_own_certificate_names_its_files(finished_folder: Path, tmp_path: Path) -> None:
+def test_fit_certificate_names_its_files(finished_folder: Path, tmp_path: Path) -> None:
+    """A fit's own certificate names its files."""
     given = ("1-robot/robot.toml", "3-measured/measured.csv")
     assert not run("fit", *(finished_folder / name for name in given), "--model", "geometry", "--out", tmp_path / "fit")
     page = (tmp_path / "fit/report.html").read_text()
@@ -158,7 +164,8 @@ def test_another_versions_report_is_refused(finished_folder: Path, tmp_path: Pat
         fit_report.read(tmp_path / "report.json")
 
 
-def test_names_of_correlated_parameters_do_not_overlap() -> None:
+def test_correlated_names_do_not_overlap() -> None:
+    """Names of correlated parameters do not overlap."""
     names = [f"shoulder_lift_joint.offset cos {k} shoulder_lift_joint" for k in range(12)]
     figure = charts.figure(geometry_figures.correlation_map(names, 0.5 + 0.5 * np.eye(12)))
     figure.draw_without_rendering()
@@ -167,7 +174,9 @@ def test_names_of_correlated_parameters_do_not_overlap() -> None:
     assert min(inches) / len(names) > 6.5 / 72.0, "a line per name"
 
 
-def test_before_and_after_differ_in_greyscale() -> None:
+def test_before_and_after_differ_in_grey() -> None:
+    """Before and after differ in greyscale."""
+
     def grey(colour: str) -> float:
         return float(np.dot(to_rgb(colour), (0.299, 0.587, 0.114)))
 
@@ -181,7 +190,8 @@ def changed(names, units, changes, sigmas) -> list[fit_report.FittedParameter]:
     ]
 
 
-def test_every_figure_is_drawn_from_plain_arrays(tmp_path: Path) -> None:
+def test_figures_are_drawn_from_plain_arrays(tmp_path: Path) -> None:
+    """Every figure is drawn from plain arrays."""
     rng = np.random.default_rng(0)
     before, after = rng.gamma(4.0, 1e-3, 60), rng.gamma(4.0, 1e-5, 60)
     q, points = rng.uniform(-2.0, 2.0, (60, 7)), rng.normal(size=(60, 3))
@@ -232,14 +242,16 @@ def test_paper_is_white_and_peaks_are_kept() -> None:
     assert x[y == 1.0] == t[31_415] and x[y == -1.0] == t[92_653]
 
 
-def test_what_the_data_do_not_give_is_left_out(finished_folder: Path) -> None:
+def test_missing_data_are_left_out(finished_folder: Path) -> None:
+    """What the data do not give is left out."""
     found = fit_report.read(finished_folder / "4-fit/report.json")
     bare = (replace(found.sets[0], q=(), points=()),)
     drawn = geometry_figures.captioned(replace(found, sets=bare, singular_values=()))
     assert "joints" not in drawn and "singular_values" not in drawn and "position" in drawn
 
 
-def test_what_was_not_checked_and_what_was_predicted_is_repeated(finished: Session) -> None:
+def test_unchecked_and_predicted_stay_told(finished: Session) -> None:
+    """What was not checked, and what was predicted, is repeated."""
     page = (finished.folder / "report.html").read_text()
     assert "poses NOT checked for" in page and "obstacles (not known)" in page and "self-collision (capsules" in page
     notes = json.loads((finished.folder / "state.json").read_text())["steps"]["fit"]["notes"]

@@ -25,7 +25,8 @@ def words(session: Session, name: str) -> str:
     return next(state.words for state in steps.states(open_session(session.folder)) if state.step.name == name)
 
 
-def test_a_finished_session_is_done_wherever_it_is(finished: Session, tmp_path: Path) -> None:
+def test_finished_session_is_done_anywhere(finished: Session, tmp_path: Path) -> None:
+    """A finished session is done wherever it is."""
     assert set(kinds(finished).values()) == {steps.DONE}
     moved = finished.folder.rename(tmp_path / "elsewhere")
     assert set(kinds(open_session(moved)).values()) == {steps.DONE}
@@ -33,7 +34,8 @@ def test_a_finished_session_is_done_wherever_it_is(finished: Session, tmp_path: 
     assert str(tmp_path) not in (moved / "state.json").read_text()
 
 
-def test_two_lines_say_what_to_do_and_what_to_bring(planned: Session) -> None:
+def test_two_lines_say_what_to_do_and_bring(planned: Session) -> None:
+    """Two lines say what to do and what to bring."""
     waiting = next(state for state in steps.states(planned) if state.kind == steps.WAITING)
     first, second = commands.asks(planned, waiting)
     assert "20 poses" in first and "optical CMM" in first and "poses.csv" in first
@@ -45,7 +47,8 @@ def test_two_lines_say_what_to_do_and_what_to_bring(planned: Session) -> None:
     )
 
 
-def test_the_fit_waits_for_validation_but_not_the_other_way_round(measured: Session) -> None:
+def test_fit_waits_for_validation(measured: Session) -> None:
+    """The fit waits for validation, but not the other way round."""
     validation = measured.path("3-measured/validation_measured.csv").rename(measured.folder / "later.csv")
     waiting = go_on(measured)
     assert waiting is not None and waiting.step.name == "validate"
@@ -56,7 +59,8 @@ def test_the_fit_waits_for_validation_but_not_the_other_way_round(measured: Sess
     assert measured.path("4-fit/robot.toml").stat().st_mtime_ns == before
 
 
-def test_a_changed_measurement_makes_stale_what_rests_on_it(finished: Session) -> None:
+def test_measurement_makes_dependents_stale(finished: Session) -> None:
+    """A changed measurement makes stale what rests on it."""
     path = finished.path("3-measured/measured.csv")
     lines = path.read_text().splitlines()
     path.write_text("\n".join(lines[:-1]) + "\n")
@@ -68,7 +72,8 @@ def test_a_changed_measurement_makes_stale_what_rests_on_it(finished: Session) -
     assert "1 of 20 planned poses remain to be measured: 20" in finished.path("3-measured/checked.txt").read_text()
 
 
-def test_a_changed_setting_makes_stale_only_what_reads_it(finished: Session) -> None:
+def test_changed_setting_makes_readers_stale(finished: Session) -> None:
+    """A changed setting makes stale only what reads it."""
     edit(finished.path("session.toml"), 'model = "geometry"', 'model = "offsets"')
     found = kinds(finished)
     assert found["select"] == steps.DONE and found["measure"] == steps.STALE
@@ -76,7 +81,8 @@ def test_a_changed_setting_makes_stale_only_what_reads_it(finished: Session) -> 
     assert json.loads(finished.path("4-fit/metrics.json").read_text())["model"] == "offsets"
 
 
-def test_a_plan_is_not_replaced_once_it_was_measured(finished: Session) -> None:
+def test_measured_plan_is_not_replaced(finished: Session) -> None:
+    """A plan is not replaced once it was measured."""
     before = finished.path("2-poses/poses.csv").read_text()
     edit(finished.path("session.toml"), "fit = 20", "fit = 25")
     assert kinds(finished)["select"] == steps.KEPT and "redo select" in words(finished, "select")
@@ -84,7 +90,8 @@ def test_a_plan_is_not_replaced_once_it_was_measured(finished: Session) -> None:
     assert finished.path("2-poses/poses.csv").read_text() == before
 
 
-def test_what_a_person_replaced_is_kept_and_said(finished: Session) -> None:
+def test_replacements_by_a_person_are_kept(finished: Session) -> None:
+    """What a person replaced is kept, and said."""
     urdf = finished.path("6-export/robot.urdf")
     urdf.write_text(urdf.read_text() + "<!-- checked -->\n")
     assert kinds(finished)["export"] == steps.DONE
@@ -97,7 +104,8 @@ def test_what_a_person_replaced_is_kept_and_said(finished: Session) -> None:
     assert "checked" in urdf.read_text()
 
 
-def test_measurements_filled_into_the_plan_are_not_written_over(planned: Session) -> None:
+def test_measurements_in_the_plan_survive(planned: Session) -> None:
+    """Measurements filled into the plan are not written over."""
     path = planned.path("2-poses/poses.csv")
     first, *rest = path.read_text().splitlines()
     path.write_text("\n".join([f"{first},x,y,z", *(f"{line},0.1,0.2,0.3" for line in rest)]) + "\n")
@@ -105,7 +113,8 @@ def test_measurements_filled_into_the_plan_are_not_written_over(planned: Session
     assert cli.run(["redo", str(planned.folder), "select"]) == 2 and path.read_bytes() == kept
 
 
-def test_redo_makes_a_step_and_all_behind_it_again(finished: Session) -> None:
+def test_redo_repeats_a_step_and_all_behind(finished: Session) -> None:
+    """Redo makes a step and all behind it again."""
     urdf = finished.path("6-export/robot.urdf")
     original = urdf.read_text()
     urdf.write_text("mine")
@@ -119,7 +128,8 @@ def test_redo_makes_a_step_and_all_behind_it_again(finished: Session) -> None:
         steps.find(finished, "identify")
 
 
-def test_killed_at_any_step_it_goes_on_from_there(measured: Session, finished_folder: Path) -> None:
+def test_killed_session_goes_on_from_there(measured: Session, finished_folder: Path) -> None:
+    """Killed at any step, it goes on from there."""
     for name in ("measure", "fit", "validate", "certificate"):
         assert _killed_at(measured, name) == -signal.SIGKILL
         assert kinds(measured)[name] == steps.READY and "interrupted" in words(measured, name)
@@ -146,7 +156,8 @@ def _killed_at(session: Session, name: str) -> int:
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
 
 
-def test_two_commands_do_not_work_on_one_session(planned: Session) -> None:
+def test_two_commands_do_not_share_a_session(planned: Session) -> None:
+    """Two commands do not work on one session."""
     with (
         locked(planned, quiet),
         pytest.raises(SessionError, match=rf"busy: process {os.getpid()}"),
@@ -157,7 +168,8 @@ def test_two_commands_do_not_work_on_one_session(planned: Session) -> None:
         pass
 
 
-def test_a_killed_commands_lock_is_taken_over(planned: Session) -> None:
+def test_lock_of_a_killed_command_is_taken(planned: Session) -> None:
+    """A killed command's lock is taken over."""
     planned.path("session.lock").write_text("process 999999 on some-host")
     said: list[str] = []
     with locked(planned, said.append):
@@ -165,7 +177,8 @@ def test_a_killed_commands_lock_is_taken_over(planned: Session) -> None:
     assert "process 999999" in said[0] and not planned.path("session.lock").exists()
 
 
-def test_a_failing_step_leaves_the_session_as_it_was(measured: Session) -> None:
+def test_failing_step_changes_no_session(measured: Session) -> None:
+    """A failing step leaves the session as it was."""
     go_on(measured)
     before = read_state(measured)
     path = measured.path("3-measured/measured.csv")
@@ -213,7 +226,8 @@ def _verdicts(content: Any) -> list[tuple[str, str]]:
     return own + [each for value in content.values() for each in _verdicts(value)]
 
 
-def test_without_a_validation_file_a_share_of_the_poses_is_held_out(measured: Session) -> None:
+def test_poses_are_held_out_by_default(measured: Session) -> None:
+    """Without a validation file, a share of the poses is held out."""
     measured.path("3-measured/validation_measured.csv").unlink()
     assert go_on(measured) is not None, "waits for the planned validation poses"
     edit(measured.path("session.toml"), "holdout = 0.0", "holdout = 0.25")
@@ -223,7 +237,8 @@ def test_without_a_validation_file_a_share_of_the_poses_is_held_out(measured: Se
     assert json.loads(measured.path("4-fit/metrics.json").read_text())["fit"]["poses"] == 15
 
 
-def test_a_failed_robots_files_say_so_until_it_does_not_fail(finished: Session, capsys: pytest.CaptureFixture) -> None:
+def test_failed_robot_says_so_in_its_files(finished: Session, capsys: pytest.CaptureFixture) -> None:
+    """A failed robot's files say so until it no longer fails."""
     place, settings = finished.path("6-export"), finished.path("session.toml")
     before = (place / "robot.urdf").read_bytes()
     marginal = (place / "README.txt").read_text()
@@ -248,12 +263,14 @@ def test_a_failed_robots_files_say_so_until_it_does_not_fail(finished: Session, 
 
 
 @pytest.mark.parametrize("head", [b"", b"\xef\xbb\xbf", b'<?xml version="1.0"?>', b'\xef\xbb\xbf<?xml version="1.0"?>'])
-def test_a_comment_goes_behind_what_xml_wants_first(head: bytes) -> None:
+def test_comment_follows_the_xml_prologue(head: bytes) -> None:
+    """A comment goes behind what XML wants first."""
     found = ElementTree.fromstring(with_comment(head + b"<robot name='a'/>", "off by 3 µm --- too much"))
     assert found.tag == "robot" and found.get("name") == "a"
 
 
-def test_a_damaged_record_is_said_and_can_be_thrown_away(finished: Session) -> None:
+def test_damaged_record_can_be_thrown_away(finished: Session) -> None:
+    """A damaged record is said, and can be thrown away."""
     finished.path("state.json").write_text('{"steps": ')
     with pytest.raises(SessionError, match="delete it"):
         steps.states(finished)
@@ -291,7 +308,8 @@ def test_a_read_only_folder_is_said(planned: Session) -> None:
 @pytest.mark.parametrize(
     "gone", ["4-fit/robot.toml", "4-fit/metrics.json", "5-validation/metrics.json", "6-export/robot.urdf"]
 )
-def test_a_step_that_lost_a_file_is_made_again(finished: Session, gone: str) -> None:
+def test_step_with_a_lost_file_is_made_again(finished: Session, gone: str) -> None:
+    """A step that lost a file is made again."""
     finished.path(gone).unlink()
     assert go_on(open_session(finished.folder)) is None
     assert finished.path(gone).exists()

@@ -13,7 +13,7 @@ from sessions import begin
 from calib.data.poses.fit_options import FitOptions
 from calib.dynamics.torque_rows import torque_rows
 from calib.errors import SessionError, UsageError
-from calib.identification.settings import IdentificationSettings
+from calib.identification.settings import IdentificationSettings, Payload
 from calib.procedure.answers import CertificateSection
 from calib.procedure.excitation.settings import HARMONICS, ExcitationSettings
 from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
@@ -45,10 +45,11 @@ def old(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_session_of_the_version_before_typed_settings_opens(old: Path) -> None:
+def test_session_before_typed_settings_opens(old: Path) -> None:
+    """A session of the version before typed settings opens."""
     found = open_session(old.parent).settings
     assert (found.poses.fit, found.instrument.tool) == (16, (0.3, 0.05, 0.02))
-    assert found.seed == 1 and found.fit.tolerance_mm == 0.0 and found.dynamics.payloads == {"loaded": 3.28}
+    assert found.seed == 1 and found.fit.tolerance_mm == 0.0 and found.dynamics.payloads == {"loaded": Payload(3.28)}
     then = tomllib.loads(OLD)
     then["robot"] |= {"controller": ""}
     then["fit"] |= {"deliverable": "urdf", "holdout": 0.0, "rounds": 3}
@@ -57,12 +58,14 @@ def test_a_session_of_the_version_before_typed_settings_opens(old: Path) -> None
     assert tomllib.loads(written(found)) == then, "nothing else is added, lost or spelled otherwise"
 
 
-def test_a_session_of_schema_1_goes_on_without_dynamics(old: Path) -> None:
+def test_schema_1_goes_on_without_dynamics(old: Path) -> None:
+    """A session of schema 1 goes on without dynamics."""
     old.write_text(OLD.replace("schema = 2", "schema = 1").split("[dynamics]")[0])
     assert not open_session(old.parent).dynamic
 
 
-def test_a_step_is_not_stale_because_a_number_is_spelled_otherwise() -> None:
+def test_number_spelling_makes_nothing_stale() -> None:
+    """A step is not stale because a number is spelled otherwise."""
     place = "session.toml [fit] tolerance_mm"
     assert changed_inputs({place: "0"}, {place: "0.0"}) == ""
     assert changed_inputs({place: "0"}, {place: "0.5"}) == f"{place} has changed"
@@ -79,7 +82,7 @@ def test_names_come_back_whatever_they_hold(name: str, given_as: str, link: str,
     assert plain(made) == tomllib.loads(written(made))
 
 
-def test_a_robot_whose_name_holds_quotes_and_lines_makes_a_session(tmp_path: Path) -> None:
+def test_odd_robot_name_makes_a_session(tmp_path: Path) -> None:
     """The name can neither break session.toml nor add keys to it."""
     name = 'a"b\\\n"""\nseed = 7\n[x]'
     joint = "[[joint]]\nlower = -1\nupper = 1\n"
@@ -121,7 +124,8 @@ def test_what_cannot_be_leaves_no_session(tmp_path: Path) -> None:
         ('loss = "none"', 'los = "none"', r"fit: there is no key 'los' \(did you mean 'loss'"),
     ],
 )  # fmt: skip
-def test_a_wrong_value_is_named_with_what_is_expected(old: Path, before: str, after: str, message: str) -> None:
+def test_wrong_value_names_the_expected(old: Path, before: str, after: str, message: str) -> None:
+    """A wrong value is named with what is expected."""
     assert before in OLD
     (old.parent / "sub").mkdir()
     old.write_text(OLD.replace(before, after, 1))
@@ -141,7 +145,8 @@ OWN = {
 }  # fmt: skip
 
 
-def test_a_new_sessions_defaults_are_the_commands() -> None:
+def test_session_defaults_are_the_commands() -> None:
+    """A new session's defaults are the commands'."""
     commands = {
         "fit": (FitOptions(), FitSettings()),
         "poses": (SelectionSettings(),),
@@ -159,7 +164,8 @@ def test_a_new_sessions_defaults_are_the_commands() -> None:
     assert torque_rows(dynamics.torques) is IdentificationSettings().torque_rows and dynamics.harmonics == HARMONICS
 
 
-def test_the_example_names_every_key_with_its_default() -> None:
+def test_example_names_keys_with_defaults() -> None:
+    """The example names every key with its default."""
     table = tomllib.loads(example())
     assert set(table) == {f.name for f in dataclasses.fields(SessionSettings)}
     assert table["dynamics"] == plain(DynamicsSection()) and table["fit"] == dataclasses.asdict(FitSection())

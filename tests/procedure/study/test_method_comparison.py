@@ -37,7 +37,7 @@ def test_methods_are_ranked_by_unseen_motion(robot: Path, tmp_path: Path):
     assert set(taken.warnings) <= set(caveats(given, found))
 
 
-def test_motion_that_was_learnt_from_ranks_nothing(robot: Path, tmp_path: Path):
+def test_learnt_motion_ranks_nothing(robot: Path, tmp_path: Path):
     """Samples in both are refused; a copy of the motion under another name, here of other noise, is no evidence."""
     train, other = recorded(tmp_path, 20.0)
     end = float(np.load(train)["t"][-1])
@@ -57,7 +57,8 @@ def test_motion_that_was_learnt_from_ranks_nothing(robot: Path, tmp_path: Path):
     assert "copy.npz" in caveats(beside, [both])[-1].text
 
 
-def test_none_is_taken_that_predicts_no_better_than_no_model(robot: Path, tmp_path: Path):
+def test_no_method_worse_than_no_model(robot: Path, tmp_path: Path):
+    """No method is chosen that predicts no better than no model."""
     train, other = recorded(tmp_path)
     content = dict(np.load(other))
     np.savez(other, **(content | {"tau": -content["tau"]}))
@@ -67,7 +68,8 @@ def test_none_is_taken_that_predicts_no_better_than_no_model(robot: Path, tmp_pa
     assert "add training motion" in caveats(given, [found])[-1].text
 
 
-def test_one_methods_error_costs_no_other_result(robot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_error_of_one_method_costs_no_other(robot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """One method's error costs no other result."""
     from calib.apps.studies import method_comparison
 
     def broken(robot, cases, settings, say):
@@ -83,7 +85,8 @@ def test_one_methods_error_costs_no_other_result(robot: Path, tmp_path: Path, mo
     assert "array must not contain infs" in found[1].failure
 
 
-def test_without_unseen_motion_there_is_no_ranking(robot: Path, tmp_path: Path):
+def test_no_ranking_without_unseen_motion(robot: Path, tmp_path: Path):
+    """Without unseen motion there is no ranking."""
     with pytest.raises(UsageError, match="--validate"):
         compare_methods(gather(robot, [recorded(tmp_path)[0]]))
 
@@ -105,7 +108,7 @@ def test_the_command_writes_what_it_shows(
     assert "[loop]" in capsys.readouterr().err
 
 
-def test_what_identify_fails_is_not_to_be_taken(robot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_failed_identification_is_not_taken(robot: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """One joint's torque is doubled in the unseen file: better than no model, and yet none of this robot."""
     train, other = recorded(tmp_path)
     content = dict(np.load(other))

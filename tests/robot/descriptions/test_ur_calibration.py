@@ -41,7 +41,8 @@ def by_table(table, q):
     return result
 
 
-def test_its_poses_are_those_of_its_table_and_near_the_nominal_arms(tmp_path):
+def test_poses_are_of_table_and_near_nominal(tmp_path):
+    """A calibration's poses are those of its table and near the nominal arm's."""
     (tmp_path / "calibration.conf").write_text(written(TABLE))
     arm, nominal = urdf.read(f"{tmp_path}/calibration.conf ur_type:=ur10e"), load("ur10e")
     assert (arm.base, arm.tip, arm.joint_names) == ("base", "tool0", nominal.joint_names)
@@ -65,7 +66,8 @@ def test_its_poses_are_those_of_its_table_and_near_the_nominal_arms(tmp_path):
         (" ur_type:=ur10e", written(TABLE).replace("delta_a = [ 2", "delta_a = [ x2"), r"delta_a: .*x2"),
     ],
 )  # fmt: skip
-def test_what_is_none_or_of_another_type_is_refused(tmp_path, arguments, content, says):
+def test_other_types_are_refused(tmp_path, arguments, content, says):
+    """What is none, or of another type, is refused."""
     (tmp_path / "calibration.conf").write_text(content)
     with pytest.raises(RobotError, match=rf"calibration\.conf: .*{says}"):
         urdf.read(f"{tmp_path}/calibration.conf{arguments}")

@@ -1,4 +1,4 @@
-"""The change of the geometry as a part of a comparison: motion of the tool in mm and mrad, with its map."""
+"""The geometry's part of a comparison: motion of the tool in mm and mrad, with a map over the workspace."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class ToolPart(ChangePart):
-    """Change of geometry; ``today`` is the rms error [m] with the earlier parameters over the poses of both fits."""
+    """Change of the geometry; ``today`` is the rms error [m] with the earlier parameters at the poses of both fits."""
 
     kind: ClassVar = "geometry"
     table: ClassVar = "changes.csv"
@@ -120,7 +120,7 @@ class ToolPart(ChangePart):
         ]
 
     def _motion(self) -> list[str]:
-        """Return sentences on the target's motion: how far, where most, and by which joint."""
+        """Return sentences on the target's motion: its size, the pose where it is largest, and the joint causing it."""
         change = self.change
         lines = []
         for motion in change.motions:
@@ -134,7 +134,7 @@ class ToolPart(ChangePart):
         return lines
 
     def _worst_joints(self, motion: ToolMotion) -> str:
-        """Return the joint values at the pose where the target moved most, as text."""
+        """Return as text the joint values at the pose where the target moved most."""
         values = []
         for joint, value in zip(self.before.chain.joints, motion.q[motion.position.argmax()]):
             factor, unit = JOINT[joint.kind]

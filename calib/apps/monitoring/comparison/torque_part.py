@@ -1,4 +1,4 @@
-"""The change of the dynamics as a part of a comparison: change of the torque over motions, with its curve."""
+"""The dynamics' part of a comparison: change of the torque along motions, with a figure of its course."""
 
 from __future__ import annotations
 
@@ -18,7 +18,13 @@ if TYPE_CHECKING:
 
 
 class _TorqueRow(NamedTuple):
-    """The change of one torque row over one motion, rms and worst [N m or N]."""
+    """The change of one torque row along one motion.
+
+    Attributes:
+        motion, name: names of the motion and of the torque row.
+        change, expected, worst: rms change, σ of the change, and largest change [N m or N].
+        torque: rms torque of the later model [N m or N].
+    """
 
     motion: str
     name: str
@@ -30,7 +36,11 @@ class _TorqueRow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TorquePart(ChangePart):
-    """Change of dynamics; ``today`` is the worst share [%] of later measured torques that the earlier model leaves."""
+    """Change of the dynamics.
+
+    ``today`` is the share [%] of the torque measured for the later model that the earlier model leaves unexplained, on
+    the worst motion.
+    """
 
     kind: ClassVar = "dynamics"
     table: ClassVar = "torque_changes.csv"
@@ -40,7 +50,7 @@ class TorquePart(ChangePart):
 
     @cached_property
     def judged(self) -> TorqueChange:
-        """The motion on which `today` is based: the worst of those measured for the later model."""
+        """Change on the motion from which `today` is computed: the worst of those measured for the later model."""
         measured = [
             change for change in self.change.torques if change.unexplained and change.where in self.after.motions
         ]
@@ -174,7 +184,7 @@ class TorquePart(ChangePart):
 
 
 def _unexplained_before(change: TorqueChange) -> float:
-    """Return the share [%] that the earlier model leaves unexplained; 0 where no torque was measured."""
+    """Return the share of the torque [%] that the earlier model leaves unexplained; 0 where no torque was measured."""
     if change.unexplained is None:
         return 0.0
     return change.unexplained[0]

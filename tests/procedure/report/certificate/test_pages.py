@@ -104,7 +104,8 @@ def said(value: object) -> list[str]:
     return [text for one in value for text in said(one)] if isinstance(value, list | tuple) else []
 
 
-def test_a_table_has_the_same_cells_on_the_console_and_on_the_page():
+def test_table_is_alike_on_page_and_console():
+    """A table has the same cells on the console and on the page."""
     written = report_of(judged(blocks=[TABLE]))
     tables = [one for one in re.findall(r"<table>.*?</table>", written, re.DOTALL) if "rms" in one and "arm" in one]
     assert len(tables) == 1
@@ -128,7 +129,8 @@ def test_every_text_is_escaped_for_all():
 
 
 @pytest.mark.parametrize("verdict", ["pass", PREDICTION_ONLY, "marginal", "fail"])
-def test_pdf_and_html_say_what_the_record_says(verdict):
+def test_pdf_and_html_say_the_record(verdict):
+    """PDF and HTML say what the record says."""
     details = CertificateSection(
         certificate_number="K-17", robot_serial="SN 0815", operator="Ä. Ünal", temperature="21.5 °C"
     )
@@ -150,7 +152,8 @@ def test_pdf_and_html_say_what_the_record_says(verdict):
     assert one.verdicts[0].label == word
 
 
-def test_the_report_has_a_table_of_contents_and_all_of_it():
+def test_report_is_complete_with_contents():
+    """The report has a table of contents, and all of it."""
     long = " ".join(f"measured{k}.csv," for k in range(80))
     lines = [f"finding {k}" for k in range(3 * MAX_LINES)]
     section = judged("marginal", "because", [TABLE, Text("Notes", lines), Pictures("", [Picture(SVG, "no title")])])
@@ -171,7 +174,8 @@ def test_what_a_certificate_cuts_it_counts():
     assert len(shown) == MAX_LINES and shown[-1] == f"{3 * MAX_LINES - MAX_LINES + 1} more: see report.html."
 
 
-def test_paths_of_this_machine_stay_in_the_report():
+def test_report_shows_paths_of_this_machine():
+    """Paths of this machine stay in the report."""
     line = "/home/someone/cell/3-measured/validation.csv: 5 rows; see ~/notes.txt, 3-measured/a.csv and m/s"
     one = certificate_of(
         judged(blocks=[Text("Findings", [line])]), known=[Entry("description", "/home/someone/robot.urdf")]
@@ -181,7 +185,7 @@ def test_paths_of_this_machine_stay_in_the_report():
 
 
 @pytest.mark.parametrize("entry", ["", "W" * MAX_LETTERS, "🤖 漢字 " * 28, "مستشعر الليزر " * 14, "שלום-SN-123 " * 16])
-def test_any_entries_leave_at_most_four_pages(entry):
+def test_any_entries_fit_four_pages(entry):
     """Everything at its bound: empty, long without a blank, emoji, Chinese, right to left."""
     details = CertificateSection(*[entry[:MAX_LETTERS].strip()] * 12)
     rows = [(f"joint{k}", *["1.234 N m"] * 6) for k in range(14)]
@@ -198,7 +202,8 @@ def test_any_entries_leave_at_most_four_pages(entry):
         assert words(document).count(entry) == 12, "no serial number is cut"
 
 
-def test_letters_that_no_font_has_are_named_and_the_rest_is_printed(monkeypatch):
+def test_unprintable_letters_are_named(monkeypatch):
+    """Letters that no font has are named, and the rest is printed."""
     one = certificate_of(judged(), details=CertificateSection(operator="田中 太郎", place="Labor 3"))
     monkeypatch.setattr(rendering, "_fonts", lambda: iter([([rendering.FONT], "a-2b"), ([rendering.FONT], None)]))
     document, notes = rendering.pdf(one)
@@ -206,7 +211,8 @@ def test_letters_that_no_font_has_are_named_and_the_rest_is_printed(monkeypatch)
     assert "田中 太郎" in rendering.html(one)
 
 
-def test_blocks_with_nothing_in_them_are_left_out():
+def test_empty_blocks_are_left_out():
+    """Blocks with nothing in them are left out."""
     section = judged(blocks=[Text("Nothing here", []), Pictures("Nor here", []), Text("This", ["line"])])
     written = report_of(section)
     assert "Nothing here" not in written and "Nor here" not in written and "This" in written
