@@ -179,7 +179,7 @@ def with_answer(answers: Answers, question: Question, text: str) -> Answers:
             value = {"y": True, "n": False}.get(text[:1].lower(), text)
     result = replace(answers, **{name: getattr(parse(Answers, {name: value}, ""), name)})
     if name == "robot":
-        require(text, "a robot is needed", UsageError)
+        require(text, "a robot is needed: a file, or a robot of the library", UsageError)
         resolve(text)
     # what is not answered yet is no error
     checked(replace(result, robot=result.robot or "", instrument=result.instrument or "tracker"))
@@ -193,7 +193,11 @@ def checked(answers: Answers) -> FieldValues:
         UsageError: for an invalid answer.
     """
     robot, instrument = answers.robot, answers.instrument
-    require(robot is not None and instrument is not None, "a robot and an instrument are needed", UsageError)
+    require(
+        robot is not None and instrument is not None,
+        "a robot and an instrument are needed: give --robot and --instrument",
+        UsageError,
+    )
     instrument_named(instrument or "")
     of_camera = [name for name in CAMERA if getattr(answers, name) is not None]
     if of_camera and _measures(answers) != IMAGES:

@@ -116,7 +116,7 @@ class ToolPart(ChangePart):
         return [
             Text("Motion", self._motion()),
             table("Motion of the tool", motions, self.change.motions),
-            table("Motion of the tool by what describes one joint", by_joint, self.change.by_joint),
+            table("Motion of the tool that the parameters of one joint explain", by_joint, self.change.by_joint),
         ]
 
     def _motion(self) -> list[str]:

@@ -144,7 +144,7 @@ class TorquePart(ChangePart):
         return [
             Text("Torque", [self._words(change) for change in self.change.torques]),
             table("Change of the torque", torques, rows),
-            table("What one joint's friction or one link's body explains", parts, self.change.parts, most=6),
+            table("Change that one joint's friction or one link's body explains", parts, self.change.parts, most=6),
         ]
 
     def _words(self, change: TorqueChange) -> str:
