@@ -60,7 +60,7 @@ class SelectionPrediction:
             selection_joints = ", ".join(self.joints)
             raise UsageError(
                 f"the selection belongs to another robot: its joints are {selection_joints}; "
-                f"this robot has {', '.join(joints)}"
+                f"this robot has {', '.join(joints)}: choose poses for it"
             )
 
 
