@@ -13,7 +13,7 @@ from calib.procedure.dynamic_stage.geometry_tables import GEOMETRIES, MIN_SHIFT,
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.metrics import TorqueCurves, UnseenReport
 from calib.procedure.report.charts import Captioned, Chart, Panel, bars, level, line, text
-from calib.procedure.report.dynamics_section import DynamicReport, IdentifiedParameter, percent, proof_of
+from calib.procedure.report.dynamics_section import SIGNIFICANT, DynamicReport, IdentifiedParameter, percent, proof_of
 from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, PAGE_WIDTH, QUIET, thinned
 from calib.procedure.robot_kinds import Mechanism
 from calib.records import read_rows
@@ -25,8 +25,6 @@ MAX_HALF_PAGE_ROWS = 8
 MAX_ELEMENTS = 15
 # parameters along an axis: more cannot be read on A4
 MAX_LABELS = 40
-# sigmas from which on a change or a value is significant
-SIGNIFICANT = 2.0
 # points of a cloud of friction, and of its curve
 MAX_CLOUD_POINTS = 1400
 CURVE_POINTS = 400

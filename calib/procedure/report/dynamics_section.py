@@ -40,8 +40,10 @@ from calib.units import small
 MAX_RSD = 50.0
 # letters of a parameter's expression that are printed
 EXPRESSION_LETTERS = 46
-# geometric errors listed
+# geometric errors listed, and parameters that they change
 MAX_EFFECTS = 8
+# change of a parameter [σ] from which on it counts as changed
+SIGNIFICANT = 2.0
 # share of autocorrelations beyond the bound below which a residual may be called white (0.05 if it is)
 WHITE = 0.10
 ERROR_NOTE = (
@@ -101,12 +103,14 @@ class DynamicReport:
         estimate: the parameters.
         effects: effects of geometric errors on the parameters; empty if the geometry is taken as exact.
         unseen: report on the model's errors on held-out motion, with the verdict.
+        geometries: each parameter identified on the nominal and on the calibrated geometry; empty for one geometry.
     """
 
     metrics: ModelMetrics
     estimate: tuple[IdentifiedParameter, ...]
     effects: tuple[geometry_tables.GeometricEffect, ...]
     unseen: UnseenReport
+    geometries: tuple[geometry_tables.TwoGeometries, ...] = ()
 
 
 def read(folder: Path) -> DynamicReport:
@@ -123,7 +127,10 @@ def read(folder: Path) -> DynamicReport:
         effects: tuple[geometry_tables.GeometricEffect, ...] = ()
         if effects_file.exists():
             effects = read_rows(geometry_tables.GeometricEffect, effects_file)
-        return DynamicReport(metrics, estimate, effects, identification.judged)
+        geometries: tuple[geometry_tables.TwoGeometries, ...] = ()
+        if (folder / geometry_tables.GEOMETRIES).exists():
+            geometries = read_rows(geometry_tables.TwoGeometries, folder / geometry_tables.GEOMETRIES)
+        return DynamicReport(metrics, estimate, effects, identification.judged, geometries)
     except (OSError, ValueError) as error:
         raise UsageError(f"{folder}: {error}; identify again: calib redo … identify") from error
 
@@ -207,6 +214,7 @@ def report_section(
     blocks.append(page.Text("The model", _model_sentences(metrics)))
     blocks.append(page.Text("What the motion identifies", _identifiability(report)))
     blocks += _geometry_blocks(metrics, report.effects)
+    blocks += _comparison_blocks(report.geometries)
     blocks.append(page.pictures("", figures, ("geometries", "geometry_effects")))
     blocks.append(page.pictures("Dynamic parameters", figures, ("significance",)))
     blocks.append(_parameter_table(report.estimate))
@@ -507,6 +515,30 @@ def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.Ge
     if geometry.changed and relevant:
         blocks.append(_effect_table(relevant[:MAX_EFFECTS]))
     return blocks
+
+
+def _comparison_blocks(rows: Sequence[geometry_tables.TwoGeometries]) -> list[page.Block]:
+    """Return the table of the parameters that the calibrated geometry changes most, in σ; empty for one geometry."""
+    if not rows:
+        return []
+    changes = []
+    for row in rows:
+        if row.sigma_calibrated > 0.0:
+            changes.append((abs(row.calibrated - row.nominal) / row.sigma_calibrated, row))
+    changes.sort(key=lambda change: -change[0])
+    table = []
+    for sigmas, row in changes[:MAX_EFFECTS]:
+        nominal = f"{row.nominal:.4g} ± {row.sigma_nominal:.2g}"
+        calibrated = f"{row.calibrated:.4g} ± {row.sigma_calibrated:.2g}"
+        table.append([row.name, row.unit, nominal, calibrated, f"{sigmas:.2g} σ", row.essential])
+    count = sum(sigmas > SIGNIFICANT for sigmas, _ in changes)
+    note = (
+        f"{count} of {len(rows)} parameters change by more than {SIGNIFICANT:g} σ between the nominal and the calibrated "
+        "geometry, identified from the same torques; all: geometries.csv."
+    )
+    header = ("parameter", "unit", "nominal geometry", "calibrated geometry", "change", "essential")
+    title = "What the calibrated geometry changed in the dynamics"
+    return [page.ReportTable(title, header, table, note, numbers=[2, 3, 4])]
 
 
 def _effect_table(effects: Sequence[geometry_tables.GeometricEffect]) -> page.ReportTable:
