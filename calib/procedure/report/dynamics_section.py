@@ -521,20 +521,18 @@ def _comparison_blocks(rows: Sequence[geometry_tables.TwoGeometries]) -> list[pa
     """Return the table of the parameters that the calibrated geometry changes most, in σ; empty for one geometry."""
     if not rows:
         return []
-    changes = []
-    for row in rows:
-        if row.sigma_calibrated > 0.0:
-            changes.append((abs(row.calibrated - row.nominal) / row.sigma_calibrated, row))
-    changes.sort(key=lambda change: -change[0])
+    with_sigma = [row for row in rows if row.sigma_calibrated > 0.0]
+    changes = np.array([(row.calibrated - row.nominal) / row.sigma_calibrated for row in with_sigma])
     table = []
-    for sigmas, row in changes[:MAX_EFFECTS]:
+    for k in np.argsort(-np.abs(changes), kind="stable")[:MAX_EFFECTS]:
+        row = with_sigma[k]
         nominal = f"{row.nominal:.4g} ± {row.sigma_nominal:.2g}"
         calibrated = f"{row.calibrated:.4g} ± {row.sigma_calibrated:.2g}"
-        table.append([row.name, row.unit, nominal, calibrated, f"{sigmas:.2g} σ", row.essential])
-    count = sum(sigmas > SIGNIFICANT for sigmas, _ in changes)
+        table.append([row.name, row.unit, nominal, calibrated, f"{changes[k]:.2g} σ", row.essential])
+    count = int(np.sum(np.abs(changes) > SIGNIFICANT))
     note = (
-        f"{count} of {len(rows)} parameters change by more than {SIGNIFICANT:g} σ between the nominal and the calibrated "
-        "geometry, identified from the same torques; all: geometries.csv."
+        f"{count} of {len(rows)} parameters change by more than {SIGNIFICANT:g} σ between the nominal and the "
+        "calibrated geometry, identified from the same torques; all: geometries.csv."
     )
     header = ("parameter", "unit", "nominal geometry", "calibrated geometry", "change", "essential")
     title = "What the calibrated geometry changed in the dynamics"
