@@ -96,10 +96,10 @@ class Workspace:
 
 @dataclass(frozen=True, eq=False)
 class Clearance:
-    """Minimum distance `least` [m] between pairs of bodies.
+    """Constraint on the smallest distance between two bodies: at least `least` [m] for every given pair.
 
     Attributes:
-        distances: q (N, n) -> (N, k) distances of the pairs [m], negative where bodies overlap.
+        distances: q (N, n) -> (N, k) distances of the k pairs [m], negative where bodies overlap.
         gradients: q (N, n) -> (N, k, n), the derivatives of the distances by q.
         labels: (k,) names of the pairs.
     """

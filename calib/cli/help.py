@@ -40,7 +40,10 @@ def type_word(kind: object, choices: tuple[str, ...] | str = ()) -> str | None:
 
 
 class _Spelt(_ClickCommand):
-    """Help text in characters that the console can print; Typer alone would always write UTF-8."""
+    """Base class of commands whose help text uses only characters that the console can print.
+
+    Typer alone would always write UTF-8.
+    """
 
     def get_help(self, ctx: Any) -> str:
         console = sys.stdout.encoding or "utf-8"
@@ -83,6 +86,9 @@ def spelt(error: Any) -> tuple[str, int]:
     """Return ASCII replacements (sigma, ^2, ...) for characters that an encoding lacks; an error handler of `codecs`.
 
     Characters without a replacement are represented by their number.
+
+    Args:
+        error: the UnicodeEncodeError with the text and the position of the characters.
 
     Returns:
         The replacements, and the position at which the encoding continues.

@@ -73,9 +73,10 @@ class Observed(NamedTuple):
     columns: np.ndarray | slice
 
     def by_regressor(self, by_information: np.ndarray) -> np.ndarray:
-        """Return the gradient ∂F/∂regressor (N, n, b) = 2 W S, divided by the sigmas.
+        """Return the gradient ∂F/∂regressor (N, n, b) = 2 W S, divided by the standard deviations `sigmas`.
 
-        S = ∂F/∂M (c, c) is symmetric.
+        Args:
+            by_information: S = ∂F/∂M (c, c), symmetric gradient of an index F by the information matrix M.
         """
         count, n, b = self.shape
         slope = np.zeros((b, n, count))
@@ -126,13 +127,18 @@ class Excitation:
         return f"{self.index} scaled"
 
     def evaluate(self, motion: SampledMotion, regressor: np.ndarray) -> Value:
-        """Return the index and its gradient with respect to the information matrix, from a regressor (N, n, b)."""
+        """Return the index of a motion and its gradient with respect to the information matrix.
+
+        Args:
+            motion: the motion; not used, since the regressor is given.
+            regressor: (N, n, b) of the motion's N samples.
+        """
         return self.seen(self.observed(regressor))
 
     def observed(self, regressor: np.ndarray) -> Observed:
-        """Return the observation matrix and its information matrix, from a regressor (N, n, b).
+        """Return the weighted observation matrix and its information matrix, from the regressor (N, n, b) of a motion.
 
-        They contain the columns that this objective uses.
+        They contain only the regressor's columns that this objective uses.
         """
         columns = slice(None)
         if self.columns is not None:
@@ -187,9 +193,10 @@ class Excitation:
         return value, by_m, exact
 
     def _trace(self, M: np.ndarray) -> tuple[float, np.ndarray, float]:
-        """Return the index log tr(A M⁻¹) / 2, its derivative -M⁻¹ A M⁻¹ / (2 tr) by M, and the unsmoothed index.
+        """Return the index log tr(A M⁻¹) / 2 of M (c, c), its derivative by M, and the unsmoothed index.
 
-        The third value repeats the first, since this index needs no smoothing.
+        The derivative is -M⁻¹ A M⁻¹ / (2 tr(A M⁻¹)). The third value repeats the first, since this index needs no
+        smoothing.
         """
         d = np.diag(M) ** -0.5
         scaled = M * d * d[:, None]
@@ -204,7 +211,11 @@ class Excitation:
         return value, -0.5 * spread @ inverse / trace, value
 
     def _of_spectrum(self, eigenvalues: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the index F and its derivative ∂F/∂λ from the eigenvalues λ, smallest first."""
+        """Return the index F and its derivative ∂F/∂λ from the eigenvalues λ (c,) of the information matrix.
+
+        Args:
+            eigenvalues: λ, smallest first.
+        """
         if self.index == "logdet":
             return -float(np.log(eigenvalues).mean()), -1.0 / eigenvalues / len(eigenvalues)
         low, by_low = _extreme(eigenvalues, -self.sharpness)
@@ -263,8 +274,9 @@ class FrictionCoverage:
 
         F = mean over joints and the four ranges of  (max(0, 1 - share / wanted))²
 
-    Shares are means of logistic memberships of v. High speed: σ((±v - high) / (`width` high)); low speed: σ(±v / w) -
-    σ((±v - low) / w) with w = `width` low.
+    The four ranges of speed are fast and slow, each forward and backward. The share of time in a range is the mean of a
+    smooth (logistic) membership of v. With the logistic function σ, high speed is σ((±v - high) / (`width` high)) and
+    low speed is σ(±v / w) - σ((±v - low) / w), w = `width` low.
 
     Attributes:
         low, high: (n,) speeds [rad/s or m/s], 0 < low < high.
@@ -299,7 +311,11 @@ class FrictionCoverage:
         return Value(value, None, slope, exact=value)
 
     def shares(self, motion: SampledMotion) -> np.ndarray:
-        """Return the unsmoothed shares of time (4, n): fast forward, slow forward, fast backward, slow backward."""
+        """Return the shares of time (4, n) without smoothing: fast forward, slow forward, fast backward, slow backward.
+
+        Args:
+            motion: the motion, whose samples have equal time steps.
+        """
         rows = []
         for v in (motion.v, -motion.v):
             fast = (v > self.high).mean(axis=0)
@@ -324,7 +340,12 @@ Objective = Excitation | TorqueSlack | FrictionCoverage | Duration
 
 
 def information(stacked: np.ndarray, existing: np.ndarray | None = None) -> np.ndarray:
-    """Return M = Wᵀ W + M_existing (b, b) of a stacked W (rows, b); Wᵀ W where `existing` is None."""
+    """Return the information matrix M = Wᵀ W + M_existing (b, b).
+
+    Args:
+        stacked: W (rows, b), the observation matrix.
+        existing: M_existing (b, b), information of motions recorded before; None for no such motions.
+    """
     M = stacked.T @ stacked
     if existing is None:
         return M
@@ -342,13 +363,13 @@ def condition_numbers(
     It is computed by SVD of the observation matrix, which is more accurate than by the eigenvalues of M.
 
     Args:
-        regressor: (N, n, b).
+        regressor: (N, n, b) of a motion's N samples.
         sigmas: (n,) standard deviations by which the rows are divided; None takes 1.
         existing: (b, b) information matrix of motions recorded before; None for no such motions.
         columns: (c,) indices of the columns to use; None uses all.
 
     Returns:
-        The condition numbers by "raw" and "normalised"; infinite where a column is zero.
+        The condition numbers by "raw" and "normalised"; infinite if a column is zero.
     """
     if sigmas is not None:
         regressor = regressor / sigmas[:, None]
@@ -376,13 +397,16 @@ def _cond(s: np.ndarray) -> float:
 
 
 def _stacked(regressor: np.ndarray) -> np.ndarray:
-    """Return W (n N, b), joint after joint, without a copy where the regressor's memory is ordered (b, n, N)."""
+    """Return the observation matrix W (n N, b), the rows of joint 1 first, from a regressor (N, n, b).
+
+    The result shares the regressor's memory if that is ordered (b, n, N).
+    """
     count, n, b = regressor.shape
     return regressor.transpose(2, 1, 0).reshape(b, n * count).T
 
 
 def _extreme(eigenvalues: np.ndarray, p: float) -> tuple[float, np.ndarray]:
-    """Return log (Σ λ^p)^(1/p) of eigenvalues λ, and its gradient by λ.
+    """Return log (Σ λ^p)^(1/p) of eigenvalues λ (c,), a smoothed log of an extreme eigenvalue, and its gradient by λ.
 
     For p = ∞ the value is the log of the largest λ, for p = -∞ of the smallest.
     """

@@ -73,7 +73,7 @@ class ConstraintRows:
         return cls(s, q, slope, curvature, A, B, G, limits)
 
     def speed(self, fastest_joint: float) -> float:
-        """Return the x = ṡ² up to which no joint exceeds the speed `fastest_joint` [rad/s or m/s] on the path."""
+        """Return the largest x = ṡ² at which no joint exceeds the speed `fastest_joint` [rad/s or m/s]."""
         steepest = np.abs(self.slope).max()
         return (fastest_joint / steepest) ** 2
 
@@ -159,7 +159,11 @@ class ConstraintRows:
 
 
 def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
-    """Return the fastest speed profile from rest to rest that satisfies the rows.
+    """Return the fastest speed profile from rest to rest that satisfies the inequalities |a u + b x + c| ≤ 1.
+
+    Args:
+        rows: the inequalities, with u = s̈ and x = ṡ².
+        s: (K + 1,) grid of path parameters.
 
     Raises:
         NothingFeasible: at some grid point no speed satisfies the limits, or the motion comes to rest before the end.
@@ -191,7 +195,14 @@ def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
 
 
 def _largest(rows: _Bounded, k: int, x: float, step: float) -> float:
-    """Return the largest path acceleration u on interval k, which begins with x = ṡ² and is `step` long."""
+    """Return the largest path acceleration u on interval k (from 0), which begins with x = ṡ² and is `step` long.
+
+    Args:
+        rows: limits as inequalities |a u + b x + c| ≤ 1, with u = s̈.
+        k: index of the interval.
+        x: ṡ² at its beginning.
+        step: its length, in the unit of the path parameter s.
+    """
     right = rows.a[1, k] + 2 * step * rows.b[1, k]
     a = np.concatenate([rows.a[0, k], right])
     left_constant = rows.b[0, k] * x + rows.c[0, k]
@@ -205,10 +216,14 @@ def _largest(rows: _Bounded, k: int, x: float, step: float) -> float:
 
 
 def _controllable(rows: _Bounded, s: np.ndarray) -> np.ndarray:
-    """Return, for each grid point, the largest x (K + 1,) from which the path's end can be reached at rest.
+    """Return, for each grid point, the largest x = ṡ² (K + 1,) from which the path's end can be reached at rest.
 
-    NaN where there is no such x. u and x are passed to toppra in units of a typical x; otherwise its linear programs
-    fail where speeds are large.
+    NaN where there is no such x. u = s̈ and x are passed to toppra in units of a typical x; otherwise its linear
+    programs fail where speeds are large.
+
+    Args:
+        rows: limits as inequalities |a u + b x + c| ≤ 1.
+        s: (K + 1,) grid of path parameters.
     """
     try:
         from toppra.algorithm import TOPPRA
@@ -245,7 +260,7 @@ class _Interval:
 
 
 def _constraint(rows: _Bounded, s: np.ndarray) -> Any:
-    """Return the rows as a constraint object of toppra."""
+    """Return the inequalities `rows`, |a u + b x + c| ≤ 1, on the grid s (K + 1,) in the form that toppra uses."""
     from toppra.constraint import LinearConstraint
 
     steps = np.diff(s)[:, None]
