@@ -410,7 +410,7 @@ def _options(kind: type) -> Iterator[Parameter]:
 
 
 def _typed(metadata: Sequence[object]) -> Typed:
-    """Return, from an annotation's metadata, how a setting is typed on the command line; a default if it is not stated."""
+    """Return how a setting is typed on the command line, from its annotation's metadata; or a default."""
     for item in metadata:
         if isinstance(item, Typed):
             return item

@@ -144,9 +144,7 @@ class StoredResult:
         return None
 
     def check_arm(self, verb: str) -> None:
-        """Raise an error if the command `verb` does not support the robot of this result; the base class accepts all
-        robots.
-        """
+        """Raise an error if the command `verb` does not support this result's robot; the base class never does."""
 
     def require_session(self) -> Session:
         """Raise an error, since the result is not a session; the class of sessions returns the session instead."""

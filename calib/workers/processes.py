@@ -262,7 +262,10 @@ class Processes:
         )
 
     def settled(self) -> Iterator[Answer]:
-        """Yield the answers of tasks that end after Ctrl-C; worker processes that did not receive it are interrupted."""
+        """Yield the answers of tasks that end after Ctrl-C.
+
+        Worker processes that did not receive the Ctrl-C are interrupted.
+        """
         self.stopping = True
         for patience in (GRACE, 2 * GRACE):
             deadline = time.monotonic() + patience

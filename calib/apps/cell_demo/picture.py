@@ -38,7 +38,7 @@ def draw(session: Session) -> None:
 
 
 def _seen_from(points: np.ndarray) -> np.ndarray:
-    """Return points (..., 3) [m] projected along the viewing direction: (..., 2), rightwards and upwards [m]."""
+    """Return points (..., 3) [m] projected onto the picture: (..., 2) [m], rightwards and upwards."""
     cos_azimuth, sin_azimuth = np.cos(AZIMUTH), np.sin(AZIMUTH)
     cos_elevation, sin_elevation = np.cos(ELEVATION), np.sin(ELEVATION)
     right = [-sin_azimuth, cos_azimuth, 0.0]

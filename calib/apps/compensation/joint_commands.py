@@ -189,7 +189,9 @@ def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tup
 
     Args:
         fitted: the calibrated arm and its cell.
-        frame, tool: frame of the targets, and tool at them; the module's docstring lists the choices.
+        frame: frame of the targets: ``base`` (of the calibrated robot), ``nominal``, or the name of a station.
+        tool: what is at the targets: ``flange``, a tool of the fit, or ``x,y,z[,roll,pitch,yaw]`` in the flange [m,
+            rad].
 
     Raises:
         UsageError: a frame or tool that the fit does not have.
@@ -261,7 +263,7 @@ def computed(
     Args:
         fitted: the calibrated arm and its cell.
         targets: joint values or poses.
-        frame, tool: frame of the targets, and tool at them; the module's docstring lists the choices.
+        frame, tool: frame of the targets, and tool at them, as for `placements`.
         dof: number of constrained pose components, as for `calib.geometry.inverse.Goal`; None for all that the targets
             contain and the arm can reach.
         start: (n,) joint values near which targets without joint values are sought [rad or m]; None for the middle of
@@ -338,6 +340,11 @@ def _followed(goal: Goal, poses: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Return joint values (m, n) near `start` (m, n) that reach the poses (m, 4, 4).
 
     Near a singularity, the motion away from `start` is limited, and the poses may not be reached.
+
+    Args:
+        goal: the arm with tool and joint limits, and the constrained pose components.
+        poses: target poses.
+        start: joint values [rad or m], one row per pose.
     """
     clipped = np.clip(start, goal.lower, goal.upper)
     q = nearest(goal, poses, clipped, reach(goal, poses, start))
@@ -350,7 +357,13 @@ def _followed(goal: Goal, poses: np.ndarray, start: np.ndarray) -> np.ndarray:
 def _dof(targets: Targets, chain: Chain, requested: int | None) -> tuple[int, Finding]:
     """Return the number of constrained pose components (6, 5 or 3), and a finding that states it.
 
-    With `requested` None, all components that the targets contain and the arm can reach are constrained.
+    Args:
+        targets: the targets.
+        chain: the arm.
+        requested: number that the user requested; None: all components that the targets contain and the arm can reach.
+
+    Raises:
+        UsageError: another number, or more components than the targets contain.
     """
     joints_only = targets.q is not None and targets.position is None
     oriented = targets.rotation is not None or joints_only
@@ -372,7 +385,14 @@ def _dof(targets: Targets, chain: Chain, requested: int | None) -> tuple[int, Fi
 
 
 def _reference(goal: Goal, targets: Targets, start: Sequence[float] | None, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the poses (m, 4, 4) of the targets, and the nominal robot's joint values (m, n) there [rad or m]."""
+    """Return the poses (m, 4, 4) of the targets, and the nominal robot's joint values (m, n) there [rad or m].
+
+    Args:
+        goal: the nominal arm with tool and joint limits.
+        targets: joint values or poses.
+        start: (n,) joint values near which targets without joint values are sought; None: the middle of the limits.
+        seed: seed of further starts.
+    """
     if targets.position is None:
         assert targets.q is not None
         return see(goal.cell, targets.q).poses(), np.array(targets.q)
@@ -393,7 +413,13 @@ def _reference(goal: Goal, targets: Targets, start: Sequence[float] | None, seed
 def _sought(goal: Goal, poses: np.ndarray, start: np.ndarray, starts: np.ndarray) -> np.ndarray:
     """Return the nominal robot's joint values (m, n) at the poses.
 
-    Of several solutions, the nearest to `start` (n,) is returned. The search begins at `start` and at each of `starts`.
+    Of several solutions, the nearest to `start` is returned.
+
+    Args:
+        goal: the nominal arm with tool and joint limits.
+        poses: (m, 4, 4) target poses.
+        start: (n,) joint values [rad or m] from which the search begins first.
+        starts: (k, n) further joint values from which it begins.
     """
     best = np.tile(start, (len(poses), 1))
     cost = np.full(len(poses), np.inf)
@@ -421,7 +447,12 @@ def _sizes(difference: np.ndarray) -> np.ndarray:
 
 
 def _within(sizes: np.ndarray, tolerance: tuple[float, float]) -> np.ndarray:
-    """Return whether each row of errors (m, 2) is within the tolerance, (m,) bool; an orientation of NaN always is."""
+    """Return whether each row of errors is within the tolerance, (m,) bool.
+
+    Args:
+        sizes: (m, 2) position [m] and orientation [rad] errors; an orientation error of NaN is within any tolerance.
+        tolerance: largest position [m] and orientation [rad] error.
+    """
     position, turn = sizes.T
     return (position <= tolerance[0]) & ~(turn > tolerance[1])
 
@@ -435,7 +466,17 @@ def _reason(
     residual: np.ndarray,
     singular: bool,
 ) -> str:
-    """Return why a target is not reached; for a reached target, the joints beyond the measured range, else empty."""
+    """Return why a target is not reached; for a reached target, the joints beyond the measured range, else empty.
+
+    Args:
+        chain: the nominal arm.
+        reached: whether the target is reached.
+        extrapolated: (n,) True for joints outside the range of the fitted poses.
+        nominal: (n,) joint values of the nominal robot at the target [rad or m].
+        q: (n,) joint command [rad or m].
+        residual: (2,) position [m] and orientation [rad] errors of the command.
+        singular: whether the command was limited near a singularity.
+    """
     if reached:
         names = [name for name, out in zip(chain.joint_names, extrapolated) if out]
         if not names:
@@ -462,6 +503,12 @@ def _predicted_sigmas(
     """Return the tool's sigmas (m, 2) due to the parameters' covariance, and expected errors (m, 2), as in `Commands`.
 
     A tool whose placement was not fitted counts as exactly known.
+
+    Args:
+        fitted: the calibrated arm and its cell.
+        q: (m, n) joint commands [rad or m].
+        frame, tool: frame of the targets, and tool at them, as for `placements`.
+        goal: the calibrated arm with the tool, and the constrained pose components.
     """
     cell, free, covariance = fitted.cell, fitted.free, fitted.covariance
     if tool in cell.tool_names:
@@ -485,7 +532,14 @@ def _predicted_sigmas(
 
 
 def _frame_note(fitted: Fitted, frame: str) -> Finding:
-    """Return the finding that names the targets' frame, with the distance between the frames base and nominal."""
+    """Return the finding that names the targets' frame.
+
+    It includes the distance between the frames ``base`` and ``nominal``.
+
+    Args:
+        fitted: the calibrated arm and its cell.
+        frame: ``base``, ``nominal``, or the name of a station.
+    """
     if frame not in ("base", "nominal"):
         return finding("targets-in-station", station=frame)
     shift = turn = None
@@ -498,7 +552,12 @@ def _frame_note(fitted: Fitted, frame: str) -> Finding:
 
 
 def _turn_note(fitted: Fitted, dof: int) -> list[Finding]:
-    """Return a finding if orientations are constrained although none was measured for the fit; else an empty list."""
+    """Return a finding if orientations are constrained although none was measured for the fit; else an empty list.
+
+    Args:
+        fitted: the calibrated arm and its cell.
+        dof: number of constrained pose components.
+    """
     table = layout(fitted.cell)
     measured = np.intersect1d(fitted.free, table.index("tool"))
     axes = {table.names[k].rsplit(".", 1)[-1] for k in measured}
@@ -518,6 +577,10 @@ def _unreached(commands: Commands) -> list[str]:
 
 def write(commands: Commands, out: Path, partial: bool = False) -> Path:
     """Write the commands as CSV (format of `calib.data.poses.pose_lists`) and return its path.
+
+    Args:
+        out: the CSV file.
+        partial: also write the commands if some targets are not reached.
 
     Raises:
         UsageError: no target is reached, or, without `partial`, some are not; nothing is written.
@@ -598,7 +661,7 @@ def _expectation(commands: Commands) -> Finding:
 
 
 def _rms_pair(errors: np.ndarray) -> str:
-    """Return the rms of errors (m, 2) in position [m] and orientation [rad] as text."""
+    """Return the rms over m targets of position [m] and orientation [rad] errors (m, 2) as text."""
     position, turn = np.sqrt(np.mean(errors**2, axis=0))
     text = f"{1e3 * position:.3g} mm"
     if not np.isnan(turn):

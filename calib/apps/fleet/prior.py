@@ -154,6 +154,11 @@ def write(folder: Path, robots: Sequence[CalibratedChain], parameters: Sequence[
     """Write the prior for `calib fit` into a folder, and return its path.
 
     ``robot.toml`` is the expected arm; the options file contains the prior's standard deviations.
+
+    Args:
+        folder: the folder.
+        robots: calibrated arms with one nominal description.
+        parameters: distribution of each fitted parameter over these arms.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_calibrated(folder, expected_arm(robots, parameters), comment=f"mean of {len(robots)} arms")

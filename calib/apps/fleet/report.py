@@ -105,6 +105,10 @@ class FleetReport(ReportedResult):
 
         The folder contains report.html, fleet.csv (a row per arm) and metrics.json, and for each type a prior for the
         fit of the type's next arm.
+
+        Args:
+            out: the folder.
+            plots: whether figures are drawn.
         """
         out = Path(out)
         folders.check_target(out, OURS, (folders.METRICS,), "fleet report")
@@ -277,6 +281,10 @@ def _arms_of_type(types: list[list[Calibration]], calibration: Calibration) -> l
     """Return the list in `types` of the arms with this arm's nominal description.
 
     Where there is no such list, an empty one is appended to `types` and returned.
+
+    Args:
+        types: lists of calibrations, each of arms with one nominal description.
+        calibration: calibration of the arm.
     """
     for arms in types:
         with suppress(RobotError):
@@ -320,9 +328,12 @@ def _arm_type(name: str, arms: Sequence[Calibration]) -> ArmType:
 
 
 def _farthest(calibration: Calibration) -> tuple[str, float]:
-    """Return the name of the parameter that is farthest from nominal, and its relative deviation.
+    """Return the name of the parameter that is farthest from nominal, and its deviation.
 
     The deviation is divided by the plausible one for the parameter's unit (`PLAUSIBLE`).
+
+    Args:
+        calibration: calibration of the arm.
     """
     nominal = calibration.robot.nominal or calibration.chain
     plausible = [PLAUSIBLE[unit] for unit in nominal.units]

@@ -86,8 +86,8 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
     Thinning keeps rows whose errors are independent.
 
     Args:
-        log_file: times and joint values, by the controller's clock.
-        file: times and positions, with or without quaternions, by the instrument's clock.
+        log_file: file with times and joint values, by the controller's clock.
+        file: file with times and positions, with or without quaternions, by the instrument's clock.
         chain: the nominal arm.
 
     Raises:
@@ -219,6 +219,11 @@ def _usable(cell: Installation, run: Run, clock: Clock) -> tuple[np.ndarray, np.
 
     Unusable rows are counted in the stream. Residuals are taken to have the variance σ² across the motion, and σ² + v²
     σ_t² along the motion at speed v, with σ_t the uncertainty of the time.
+
+    Args:
+        cell: the fitted arm with station and tool.
+        run: the recordings of controller and instrument.
+        clock: the fitted clock.
     """
     stream = run.stream
     usable = run.known(clock)
@@ -246,7 +251,11 @@ def _usable(cell: Installation, run: Run, clock: Clock) -> tuple[np.ndarray, np.
 
 
 def _joints(chain: Chain) -> Kind:
-    """Return how a log's joint values are read and checked: columns, units and joint limits."""
+    """Return how a log's joint values are read and checked for an arm: columns, units and joint limits.
+
+    Args:
+        chain: the arm.
+    """
     robot = joints_of(chain)
     # limits, and for a joint without any a bound of the right unit
     travel = max_travel(robot.kinds)

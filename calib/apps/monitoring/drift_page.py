@@ -100,6 +100,10 @@ class DriftFound(ChartedResult, ReportedResult):
         """Write the result into a folder and return its path.
 
         The folder contains report.html, trends.csv, metrics.json, and the figure as PNG.
+
+        Args:
+            out: the folder.
+            plots: whether figures are drawn.
         """
         rows: list[tuple[object, ...]] = []
         for trend in self.trends:

@@ -94,7 +94,7 @@ class Placements(GeometryFit):
         return tuple(frames)
 
     def lines(self, *first: str) -> Iterator[str]:
-        """Yield the console lines: verdict, residual, and the frames whose names begin with one of `first`."""
+        """Yield the console lines: verdict, residual, and the frames whose names begin with one of the texts `first`."""
         poses = self.fit.poses
         yield str(self.verdict)
         for frame in self.placed:
@@ -111,7 +111,11 @@ class Placements(GeometryFit):
 
 
 def _turned(pose: np.ndarray) -> np.ndarray:
-    """Return the Jacobian (6, 6) of small motions along the reference axes by those along a frame's own axes."""
+    """Return the Jacobian (6, 6) of small motions along the reference axes by those along a frame's own axes.
+
+    Args:
+        pose: (4, 4) pose of the frame in the reference frame.
+    """
     return np.kron(np.eye(2), pose[:3, :3])
 
 
@@ -141,7 +145,11 @@ def _sigma(estimate: Estimate, name: str, jacobian: np.ndarray) -> np.ndarray:
 
 
 def _stated(values: np.ndarray, sigmas: np.ndarray) -> str:
-    """Return as text values with three decimals and their standard deviations, both in one unit."""
+    """Return as text values with three decimals and their standard deviations.
+
+    Args:
+        values, sigmas: values and standard deviations, in one unit.
+    """
     texts = []
     for value, sigma in zip(values, sigmas):
         if np.isnan(sigma):

@@ -131,7 +131,7 @@ def application(work: Work, token: str = "", host: str = "127.0.0.1") -> Starlet
 
 
 def refused(request: Request, error: Exception) -> Response:
-    """Return a page that shows an error's message."""
+    """Return a page that shows the message of the error that a request caused."""
     message = str(error)
     foreseen = complaint(error)
     if foreseen:
@@ -247,7 +247,7 @@ def view(request: Request) -> Response:
 
 
 def go_on(request: Request) -> Response:
-    """Start a run of `calib next`, or of `calib redo` if the path contains a step.
+    """Start a run of `calib next`, or of `calib redo` if the request's path contains a step.
 
     The request is ignored while a run is in progress.
     """

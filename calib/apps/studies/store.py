@@ -130,7 +130,11 @@ def _other_format(path: Path, version: int) -> UsageError:
 
 
 def _connected(path: Path) -> sqlite3.Connection:
-    """Return a connection to a SQLite file that is new or of this version's format; raise UsageError for any other."""
+    """Return a connection to the SQLite file at `path`, which is new or of this version's format.
+
+    Raises:
+        UsageError: a file of another format, or a damaged one.
+    """
     with refused_as(UsageError, sqlite3.DatabaseError, f"{path} is damaged: {{}}; run the study in another folder"):
         database = sqlite3.connect(path)
         version = _format(database)

@@ -201,7 +201,12 @@ def _percent(error: np.ndarray, size: np.ndarray) -> float:
 
 
 def _survey_tau(data: Experiment, values: np.ndarray) -> float:
-    """Return the survey's torque error d_τ [%] of base parameters (b,) on the data set's first recording."""
+    """Return the survey's torque error d_τ [%] of an estimate on the data set's first recording.
+
+    Args:
+        data: the data set.
+        values: (b,) estimated base parameters.
+    """
     problem = data.problem
     case = problem.cases[0]
     predicted = predict(Dynamics(problem.model, problem.base.to_standard(values)), case)
@@ -262,7 +267,13 @@ def _version(method: str) -> str:
 
 
 def grouped(condition: Condition, methods: Sequence[str], seed: int) -> list[Trials]:
-    """Return the trials of one data set as tasks: one per simulating method, one for all other methods."""
+    """Return the trials of one data set as tasks: one per simulating method, one for all other methods.
+
+    Args:
+        condition: the condition.
+        methods: names of the methods.
+        seed: seed of the trials.
+    """
     fast = [name for name in methods if not method_named(name).needs_simulation]
     tasks = []
     if fast:

@@ -112,7 +112,12 @@ class ChangeTest:
         return tuple(parameter.name for parameter in self.parameters[1:] if parameter.explained > best - AS_WELL)
 
     def suffices(self, explained: float, count: int) -> bool:
-        """Return whether the remaining χ² may be chance after `count` parameters lowered it by `explained`."""
+        """Return whether the χ² that remains after a decrease may be chance.
+
+        Args:
+            explained: decrease of χ².
+            count: number of parameters whose change was fitted for the decrease.
+        """
         residual = max(self.chi2 - explained, 0.0)
         freedom = max(self.freedom - count, 1)
         return bool(chi2.sf(residual, freedom) > CHANCE)
@@ -137,9 +142,11 @@ class Tested:
         return float(self.difference @ self.difference)
 
     def alone(self, k: int, identifiable: bool = True) -> tuple[float, float, float]:
-        """Return change, σ and decrease of χ² of parameter k if only this parameter changed.
+        """Return change, σ and decrease of χ² of a parameter if only this parameter changed.
 
-        NaN, NaN, 0 if the parameter is not `identifiable`.
+        Args:
+            k: index (from 0) of the parameter among the p parameters.
+            identifiable: whether the parameter is identifiable; if not, NaN, NaN and 0 are returned.
         """
         size = float(np.linalg.norm(self.columns[:, k]))
         if not identifiable or not size:
@@ -148,9 +155,13 @@ class Tested:
         return along / size**2, 1.0 / size, (along / size) ** 2
 
     def together(self, chosen: np.ndarray) -> tuple[np.ndarray, float, int]:
-        """Return the changes (p,) of the `chosen` parameters that lower χ² most together, the decrease, and their rank.
+        """Return the changes of several parameters that lower χ² most together.
 
-        Changes of all other parameters are 0.
+        Args:
+            chosen: indices of the parameters that may have changed; the change of all others is 0.
+
+        Returns:
+            The changes (p,), the decrease of χ², and the rank of the chosen parameters' derivatives.
         """
         columns = self.columns[:, chosen]
         size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
@@ -199,10 +210,10 @@ def tested(
 
 
 def span(columns: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis (k, r) of the column space of a matrix (k, any).
+    """Return an orthonormal basis (k, r) of the column space of a matrix of rank r.
 
     Args:
-        columns: the matrix, with columns of norm near 1 or zero.
+        columns: the matrix (k, any), with columns of norm near 1 or zero.
     """
     basis, size, _ = np.linalg.svd(columns, full_matrices=False)
     return basis[:, size > SPAN]
