@@ -94,7 +94,11 @@ class Placements(GeometryFit):
         return tuple(frames)
 
     def lines(self, *first: str) -> Iterator[str]:
-        """Yield the console lines: verdict, residual, and the frames whose names begin with one of the texts `first`."""
+        """Yield the console lines: verdict, residual, and frames.
+
+        Args:
+            *first: beginnings of the names of the frames to print.
+        """
         poses = self.fit.poses
         yield str(self.verdict)
         for frame in self.placed:

@@ -110,10 +110,13 @@ class DynamicsAssessment(RecordingErrors):
 
 
 def repeated_motion(cases: Sequence[Case], unseen: Sequence[Case]) -> dict[str, float]:
-    """Return the held-out recordings that repeat training motion: name -> share of states that are also in the
-    training.
+    """Return the held-out recordings that repeat training motion: name -> share of their states in the training.
 
-    A recording counts as a repeat from a share of `REPEAT`.
+    A state is a position with its velocity. A recording counts as a repeat from a share of `REPEAT`.
+
+    Args:
+        cases: training recordings.
+        unseen: held-out recordings.
     """
     repeated = {}
     for case in unseen:
@@ -124,7 +127,12 @@ def repeated_motion(cases: Sequence[Case], unseen: Sequence[Case]) -> dict[str, 
 
 
 def overlaps(cases: Sequence[Case], unseen: Sequence[Case]) -> list[Finding]:
-    """Return findings on held-out recordings that share samples with a training recording."""
+    """Return findings on held-out recordings that share samples with a training recording.
+
+    Args:
+        cases: training recordings.
+        unseen: held-out recordings.
+    """
     findings = []
     for case, training in product(unseen, cases):
         if not training.motion.file or realpath(case.motion.file) != realpath(training.motion.file):
@@ -296,6 +304,10 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
 
     If the torques refute the stated gravity, only the standard friction model is tried, since richer friction, such as
     couplings between joints, would absorb the gravity error.
+
+    Args:
+        inputs: robot, recordings and options.
+        progress: called with a text on each step; None: silent.
     """
     settings = inputs.options.settings
     hypotheses = gravity_hypotheses(inputs)
@@ -308,6 +320,11 @@ def judged(
     inputs: IdentificationInputs, found: Identification, progress: Progress | None = None
 ) -> IdentificationOutcome:
     """Return the outcome of a finished identification: torque predictions for every recording, errors, and the verdict.
+
+    Args:
+        inputs: robot, recordings and options.
+        found: the identification.
+        progress: called with a text on each step; None: silent.
 
     Raises:
         MeasurementError: if the identified friction accelerates most joints instead of braking them.
@@ -341,7 +358,7 @@ def judged(
 
 
 def assessed(outcome: T, inputs: IdentificationInputs) -> T:
-    """Return an outcome with predictions, errors and verdict for the recordings of `inputs`, by the unchanged model."""
+    """Return an outcome with the predictions of its unchanged model for the recordings of `inputs`, and the verdict."""
     stage = stage_of(inputs.robot, "identify")
     if stage is not None and stage.judge is not None:
         assessment = stage.judge(inputs, outcome.found, outcome.findings)
@@ -356,6 +373,11 @@ def _carry(
     """Return the effect of the geometry's uncertainty on the estimate, and the comparison with the nominal geometry.
 
     The comparison is None if the robot's geometry is the nominal one.
+
+    Args:
+        inputs: robot and recordings.
+        identification: the identified model.
+        say: called with a text on each step.
     """
     carried = geometry_uncertainty.propagate(identification, inputs.robot, inputs.cases, say)
     if inputs.robot.nominal is None or not inputs.robot.moved:

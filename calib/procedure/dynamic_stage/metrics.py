@@ -41,7 +41,7 @@ BOUND_SIGMA = 1e-9
 
 @dataclass(frozen=True)
 class ParameterCounts:
-    """Numbers of standard parameters, base parameters (identifiable from any motion), and essential parameters."""
+    """Numbers of standard parameters, base parameters (identifiable from some motion), and essential parameters."""
 
     standard: int
     base: int
@@ -172,6 +172,9 @@ def on_bounds(identification: Identification) -> tuple[str, ...]:
 
     The recordings do not identify these parameters, so that they have no σ. The covariance treats the constraint as an
     equality; the σ of the other parameters therefore assume that the fixed values are exact.
+
+    Args:
+        identification: the identification with its constrained estimate.
     """
     constrained = identification.fitted.held
     if constrained is None:
@@ -185,7 +188,7 @@ def on_bounds(identification: Identification) -> tuple[str, ...]:
 
 
 def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
-    """Return the content of ``metrics.json`` for an identification."""
+    """Return the content of ``metrics.json`` for the outcome of an identification."""
     identification, inputs = outcome.found, outcome.inputs
     base, constrained = identification.base, identification.fitted.held
     count = base.b + len(identification.friction.terms)
@@ -226,6 +229,10 @@ def _error_density(identification: Identification, cases: Sequence[Case]) -> np.
 
     The density is the variance of the errors divided by the number of independent rows per second; the information
     matrix of a motion with regressor ω is ∫ ωᵀω / density dt.
+
+    Args:
+        identification: the identification.
+        cases: training recordings.
     """
     count = sum(len(rows.target) for rows in identification.rows)
     per_second = count / sum(case.duration for case in cases)
@@ -253,7 +260,12 @@ class TorqueCurves:
 
     @classmethod
     def of(cls, case: Case, predicted: np.ndarray) -> TorqueCurves:
-        """Return the curves of a recording and the torques (N, rows) that the model predicts for it."""
+        """Return the curves of measured and predicted torques of a recording, thinned for drawing.
+
+        Args:
+            case: the recording with N samples.
+            predicted: (N, rows) torques that the model predicts for it.
+        """
         motion, measured = case.motion, np.asarray(case.target)
         picked = evenly(len(measured), MAX_POINTS)
         measured_in_band = _five_digits(motion.in_band(measured)[picked].T)
@@ -363,7 +375,7 @@ def _score(score: ParsedTable) -> ParsedTable:
 
 
 def _replay(replay: ParsedTable) -> ParsedTable:
-    """Return the simulated tracking in a file of an earlier version with the current keys."""
+    """Return the simulated tracking (`replay`) in a file of an earlier version with the current keys."""
     stored = replay["controller"]
     controller = None
     if "kp" in stored:

@@ -133,6 +133,10 @@ def read_model(
 def check_held(model: ExcitedModel, limits: MotionLimits) -> None:
     """Check that the torque limits suffice against gravity in at least half of the postures.
 
+    Args:
+        model: the model that predicts gravity torques.
+        limits: limits of the motion with the torque limits.
+
     Raises:
         UsageError: if they do not, since the payload is too heavy, or the masses or limits are wrong.
     """
@@ -168,6 +172,9 @@ def stated_payloads(options: IdentificationSettings | None) -> tuple[list[tuple[
     """Return the ten inertial parameters of each payload in the options, and notes on assumptions about the payloads.
 
     The parameters are zero for a payload without a stated mass.
+
+    Args:
+        options: options of the later identification; None: no payloads.
     """
     parameters: list[tuple[float, ...]] = []
     notes: list[str] = []
@@ -233,7 +240,7 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str], nominal: Chain
         nominal: arm on which base columns are selected; None: `chain`.
 
     Raises:
-        UsageError: if the identification does not fit the arm or the design.
+        UsageError: if the identification belongs to another arm, or its torque rows are not suited for a design.
     """
     refuse_currents(folder, "an excitation within torque limits")
     refuse_other_arm(folder, chain)
@@ -280,7 +287,12 @@ def bodies_with(chain: Chain, gravity: np.ndarray, payloads: Sequence[str]) -> B
 
 
 def moved_to(chain: Chain, model: IdentificationModel) -> IdentificationModel:
-    """Return a model, including its payloads, on another geometry of the arm."""
+    """Return a model, including its payloads, with the geometry of another arm.
+
+    Args:
+        chain: the arm.
+        model: the model.
+    """
     return replace(model, bodies=bodies_with(chain, model.bodies.gravity, _payloads(model)))
 
 
@@ -340,6 +352,10 @@ def covariance_of(path: Path, model: LoadCases) -> np.ndarray | None:
     """Return the covariance (b, b) of a model's base columns, read from a file.
 
     None if the file is missing or contains other columns.
+
+    Args:
+        path: the CSV file.
+        model: the model with its base columns.
     """
     names: Sequence[str] = ()
     covariance = np.empty((0, 0))

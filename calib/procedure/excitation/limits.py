@@ -174,6 +174,9 @@ class MotionBounds:
         `MAX` is a value that no real joint reaches. It matters if light links and high torque limits would allow
         accelerations that no robot reaches.
 
+        Args:
+            track: the setpoints.
+
         Raises:
             UsageError: for a violated limit; the message names the joint and the limit.
         """
@@ -181,7 +184,13 @@ class MotionBounds:
         self._check("acceleration", np.abs(track.a).max(axis=0), self.acceleration)
 
     def _check(self, kind: str, peak: np.ndarray, limit: np.ndarray) -> None:
-        """Raise a UsageError if the largest velocity or acceleration (n,) of a joint exceeds its limit (n,)."""
+        """Raise a UsageError if the velocity or acceleration of a joint exceeds its limit.
+
+        Args:
+            kind: ``velocity`` or ``acceleration``.
+            peak: (n,) largest values of the motion.
+            limit: (n,) limits.
+        """
         limit = np.minimum(limit, MAX[kind])
         j = int(np.argmax(peak / limit))
         if not peak[j] <= (1.0 + MAX_EXCESS) * limit[j]:
@@ -286,6 +295,9 @@ class MotionLimits:
         """Yield each violated constraint with a message and the index of the worst of N sampled states.
 
         Joint limits are not checked.
+
+        Args:
+            motion: N sampled states of the motion.
         """
         for limit in self.constraints:
             if isinstance(limit, BoxLimit):
@@ -447,7 +459,7 @@ class Points:
         return self._positions(q, sweep(self.chain, q).poses())
 
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-        """Return the gradient (N, n) of Σ G · points with respect to q, for weights G (N, k, 3)."""
+        """Return the gradient (N, n) of Σ G · points with respect to q (N, n), for weights G (N, k, 3)."""
         kinematics = sweep(self.chain, q)
         points = self._positions(q, kinematics.poses())
         gradient = np.zeros(q.shape)
@@ -494,7 +506,13 @@ class _PoseLimit:
 
 
 def _position_constraints(settings: LimitsFile, pose_limits: Limits, points: Points) -> list[MotionConstraint]:
-    """Return constraints on the workspace of tip and named points, and all other constraints of pose selection."""
+    """Return constraints on the workspace of tip and named points, and all other constraints of pose selection.
+
+    Args:
+        settings: content of the limits file.
+        pose_limits: limits of pose selection.
+        points: the named points.
+    """
     constraints: list[MotionConstraint] = []
     radius = settings.target.axis_distance
     lowest, highest = settings.target.heights

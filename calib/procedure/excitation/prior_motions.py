@@ -29,7 +29,7 @@ MIN_RATE = 50
 
 
 class PrincipalErrors(Protocol):
-    """Principal errors g_i = √λ_i u_i, i = 1 … r, of a calibrated geometry with the covariance Σ λ_i u_i u_iᵀ."""
+    """Principal errors of a calibrated geometry with the covariance Σ λ_i u_i u_iᵀ: g_i = √λ_i u_i, i = 1 … r."""
 
     @property
     def before(self) -> np.ndarray:
@@ -37,7 +37,9 @@ class PrincipalErrors(Protocol):
         ...
 
     def felt(self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the changes (N, rows, r) of the torques by each principal error, at constant base parameters.
+        """Return the changes (N, rows, r) of the torques [N m or N] by each principal error.
+
+        The base parameters are constant.
 
         Args:
             values: (b,) base parameters.
@@ -168,6 +170,10 @@ def _identified_information(
 
 def designed_orders(folder: Path, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Return q, v, a (N, n) of all periods of a designed motion, sampled at 50 Hz or more, and the sampling rate [Hz].
+
+    Args:
+        folder: folder that `calib excite` wrote.
+        chain: the arm.
 
     Raises:
         UsageError: if the motion belongs to a robot with other joints.

@@ -83,8 +83,7 @@ def chain_in(tree: UrdfTree, chain: Chain, base: str | None = None) -> Chain:
     Args:
         tree: the URDF.
         chain: the other chain.
-        base, tip: names of the first and the last link; None: the other chain's tip, and the first link is determined
-            by the joints.
+        base: name of the first link; None: determined by the joints.
     """
     joints = chain.joint_names if chain.joint_names[0] in tree.joints else None
     tip = chain.tip if chain.tip in tree.bodies else None
@@ -135,6 +134,10 @@ def export_offsets(robot: CalibratedChain, out: Path) -> Path:
     The offset is calibrated minus nominal: a joint with the reading q is at q + offset in the nominal robot's model. If
     the fit has joint corrections, offsets and their σ are those of the best geometry without corrections, for users who
     do not apply them.
+
+    Args:
+        robot: the calibrated robot.
+        out: path of the CSV file.
 
     Returns:
         Path of the table.

@@ -122,7 +122,13 @@ class ExportedPrediction:
 def exported_prediction(robot: IdentifiedRobot, folder: Path) -> ExportedPrediction | None:
     """Return the torque prediction error of the exported robot on the recording with the largest error.
 
-    None if the recordings were made with payloads, or if an earlier version did not store their velocities.
+    Args:
+        robot: the identified robot.
+        folder: folder of the identification with tables of measured torques.
+
+    Returns:
+        The error; None if the recordings were made with payloads, or if an earlier version did not store their
+        velocities.
     """
     dynamics = without_left(robot.found.dynamics)
     worst = None
@@ -186,7 +192,11 @@ def notes_of(robot: IdentifiedRobot) -> list[str]:
 
 
 def parameters(robot: IdentifiedRobot) -> dict[str, object]:
-    """Return the content of ``parameters.json``: parameters of geometry and dynamics with their covariances."""
+    """Return the content of ``parameters.json``: parameters of geometry and dynamics with their covariances.
+
+    Args:
+        robot: the identified robot.
+    """
     estimate, solution, chain = robot.information, robot.found, robot.chain
     model = solution.dynamics.model
     return {
@@ -337,8 +347,9 @@ def _sum(tree: UrdfTree, placements: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _check(robot: IdentifiedRobot, source: str, chain: Chain, where: str, mjcf: bool = False) -> None:
-    """Check that Pinocchio computes the expected frames, torques, motor inertias and friction from a file on random
-    motion.
+    """Check that Pinocchio computes the expected dynamics from a file on random motion.
+
+    Compared are frames, torques, motor inertias and friction.
 
     Args:
         robot: the identified robot.
@@ -374,7 +385,11 @@ def _check(robot: IdentifiedRobot, source: str, chain: Chain, where: str, mjcf: 
 
 
 def without_left(dynamics: Dynamics) -> Dynamics:
-    """Return an identified model in which drive terms without a column in ``drives.csv`` are zero."""
+    """Return an identified model in which drive terms without a column in ``drives.csv`` are zero.
+
+    Args:
+        dynamics: the identified model.
+    """
     omitted = drive_table(dynamics).left
     values = np.array(dynamics.values)
     for k, term in enumerate(dynamics.model.columns, dynamics.model.inertial):

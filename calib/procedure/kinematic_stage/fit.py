@@ -120,14 +120,19 @@ T = TypeVar("T", bound=Outcome)
 
 
 def weighing_settings(options: FitOptions, settings: FitSettings) -> Settings:
-    """Return the settings of the residuals' loss function: the loss in the fit's settings, otherwise in the options
-    file.
+    """Return the settings of the residuals' loss function.
+
+    The loss in the fit's settings has precedence over the loss in the options file.
+
+    Args:
+        options: content of the options file.
+        settings: settings of the fit.
     """
     return Settings(settings.loss or options.loss, options.loss_scale)
 
 
 def _silent(stage: str) -> None:
-    """Ignore a progress text."""
+    """Ignore a progress text, `stage`."""
 
 
 def run(
@@ -217,8 +222,9 @@ def run(
 def _rigid_misfit(
     selection: ModelSelection, changes: Sequence[Finding], climb: Callable[..., ModelSelection], weighing: Settings
 ) -> Finding | None:
-    """Return a finding if no rigid geometry explains the rows, or if a few grossly wrong rows are the reason; otherwise
-    None.
+    """Return a finding if no rigid geometry explains the rows, or if a few grossly wrong rows are the reason.
+
+    Otherwise, None is returned.
 
     Args:
         selection: the selection of models.
@@ -243,7 +249,15 @@ def _residual_findings(
     rigid_misfit: Finding | None,
     weighing: Settings,
 ) -> list[Finding]:
-    """Return findings on the residuals of a fit: changed rows, misfit, moved instrument, joints, images."""
+    """Return findings on the residuals of a fit: changed rows, misfit, moved instrument, joints, images.
+
+    Args:
+        selection: the selection of models.
+        inputs: robot and measurements.
+        changes: findings on changed rows.
+        rigid_misfit: finding that no rigid geometry explains the rows; None: a rigid geometry explains them.
+        weighing: settings of the loss function.
+    """
     notes = list(changes)
     if rigid_misfit:
         notes.append(rigid_misfit)
@@ -255,6 +269,11 @@ def _residual_findings(
 
 def _check_convergence(selection: ModelSelection, inputs: Inputs, options: FitOptions) -> None:
     """Check that the chosen model's fit has converged.
+
+    Args:
+        selection: the selection of models.
+        inputs: robot and measurements.
+        options: content of the options file, with the accepted findings.
 
     Raises:
         NotConverged: if it has not; the message contains findings that may be the reason.

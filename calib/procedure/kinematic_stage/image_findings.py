@@ -37,7 +37,12 @@ def image_coverage(fit: GeometricFit) -> tuple[ImageCoverage, ...]:
 
 
 def reprojection(cell: Installation, blocks: Sequence[PoseMeasurements]) -> float | None:
-    """Return the rms distance between detected and predicted corners [px]; None without images."""
+    """Return the rms distance between detected and predicted corners [px]; None without images.
+
+    Args:
+        cell: arm, camera and board, which predict the corners.
+        blocks: the measurements.
+    """
     images = [block for block in blocks if isinstance(block, Pixels)]
     no_parameters = np.array([], dtype=int)
     squares: list[np.ndarray] = []

@@ -72,7 +72,11 @@ class ComparedRows:
     position_means: str = "position"
 
     def words(self, nature: str) -> str:
-        """Return the printed name of an error (position, orientation, distance), which depends on the measurements."""
+        """Return the printed name of an error, which depends on the measurements.
+
+        Args:
+            nature: kind of the error: position, orientation or distance.
+        """
         if nature == "position":
             return self.position_means
         return nature

@@ -221,6 +221,13 @@ def _draw_views(
 ) -> np.ndarray:
     """Return feasible postures (N, n) at which the camera sees the board, at least twice as many as shall be selected.
 
+    Args:
+        view: camera and board.
+        space: search space with all constraints.
+        limits: joint limits and constraints.
+        settings: settings of the selection.
+        m: number of poses to select.
+
     Raises:
         UsageError: if fewer postures are found.
     """
@@ -253,7 +260,12 @@ def _search_settings(settings: SelectionSettings) -> SearchSettings:
 
 
 def _in_driving_order(selection: Selection, driven: Drivable) -> Selection:
-    """Return the selection in the order of the run, with index and efficiency updated for replaced poses."""
+    """Return the selection in the order of the run, with index and efficiency updated for replaced poses.
+
+    Args:
+        selection: the selected poses.
+        driven: the run through the poses, with replacements of unreachable poses.
+    """
     value = selection.value
     history = selection.history
     if driven.replaced:
@@ -276,6 +288,11 @@ def _in_driving_order(selection: Selection, driven: Drivable) -> Selection:
 
 def _draw_feasible(space: SearchSpace, limits: Limits, settings: SelectionSettings) -> np.ndarray:
     """Return random feasible poses as candidates.
+
+    Args:
+        space: search space with all constraints.
+        limits: joint limits and constraints.
+        settings: settings of the selection.
 
     Raises:
         UsageError: if too few poses are feasible; the message lists the constraints.
@@ -301,16 +318,17 @@ def _draw_feasible(space: SearchSpace, limits: Limits, settings: SelectionSettin
 def _outlook(
     jacobian: Observation, limits: Limits, search: SearchSettings, q: np.ndarray, exchange: Exchange, comparable: float
 ) -> PoseOutlook:
-    """Return the predicted accuracy with poses q (m, n), with other numbers of poses, and without line-of-sight
-    constraints.
+    """Return the predicted accuracy with the selected poses and in other cases.
+
+    The other cases are other numbers of poses, and no line-of-sight constraints.
 
     Args:
         jacobian: observation Jacobian.
         limits: limits of poses.
         search: settings of the search.
-        q: selected poses [rad or m].
+        q: (m, n) selected poses [rad or m].
         exchange: candidate poses, and Jacobians of poses measured earlier.
-        comparable: index of poses selected with line-of-sight constraints.
+        comparable: observability index of poses selected with line-of-sight constraints.
     """
     space = limits.space(jacobian, sight=False)
     existing = exchange.before
@@ -352,13 +370,22 @@ def beside_poses(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[s
 
 
 def targets(out: Path, plots: bool) -> files.Results:
-    """Return the paths of all files that a selection may write, with their allowed suffixes."""
+    """Return the paths of all files that a selection may write, with their allowed suffixes.
+
+    Args:
+        out: path of the selection's CSV.
+        plots: whether figures are written.
+    """
     beside = beside_poses(out, plots).values()
     return [(out, (".csv",)), *((path, (path.suffix,)) for path in beside)]
 
 
 def write(chosen: Chosen, path: Path) -> Path:
     """Write the selected poses to a CSV with the joints' names [rad or m], and the predicted accuracy next to it.
+
+    Args:
+        chosen: the selection.
+        path: path of the CSV.
 
     Returns:
         Path of the CSV.
@@ -385,7 +412,11 @@ def bound_words(selection: Selection) -> str:
 
 
 def record(chosen: Chosen) -> dict[str, object]:
-    """Return the results of a selection as numbers by name; `table` returns them as text."""
+    """Return the results of a selection as numbers by name; `table` returns them as text.
+
+    Args:
+        chosen: the selection.
+    """
     selection = chosen.selection
     rms = chosen.outlook.poses.rms
     return {
@@ -408,7 +439,11 @@ def record(chosen: Chosen) -> dict[str, object]:
 
 
 def table(chosen: Chosen) -> list[tuple[str, str]]:
-    """Return the results of a selection as pairs of label and text."""
+    """Return the results of a selection as pairs of label and text.
+
+    Args:
+        chosen: the selection.
+    """
     selection = chosen.selection
     index = f"{selection.index}"
     if selection.index == "O1":
@@ -431,7 +466,11 @@ def table(chosen: Chosen) -> list[tuple[str, str]]:
 
 
 def predicted_rows(chosen: Chosen) -> list[tuple[str, str]]:
-    """Return table rows (label, text) on the predicted accuracy, and on the accuracy lost by lines of sight."""
+    """Return table rows (label, text) on the predicted accuracy, and on the accuracy lost by lines of sight.
+
+    Args:
+        chosen: the selection.
+    """
     outlook = chosen.outlook
     rows = forecast.table(outlook.poses, outlook.others)
     if outlook.blind is None:
