@@ -183,7 +183,13 @@ class Pictures:
 
 
 def pictures(title: str, figures: Mapping[str, Picture], names: Iterable[str]) -> Pictures:
-    """Return the figures with the given names, to be shown side by side; absent figures are left out."""
+    """Return the figures with the given names, to be shown side by side; absent figures are left out.
+
+    Args:
+        title: title above the figures.
+        figures: name -> figure.
+        names: names of the figures to show.
+    """
     return Pictures(title, [figures[name] for name in names if name in figures])
 
 
@@ -234,7 +240,7 @@ class Section:
 
 
 def relative_sigma(percent: float | None) -> str:
-    """Return a relative standard deviation [%] as text; empty if it is None or above `MAX_PRINTED_RSD`."""
+    """Return a relative standard deviation `percent` [%] as text; empty if it is None or above `MAX_PRINTED_RSD`."""
     if percent is None or percent > MAX_PRINTED_RSD:
         return ""
     if percent >= 10:

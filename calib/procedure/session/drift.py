@@ -279,7 +279,12 @@ def _covariates(table: Table) -> Iterator[tuple[str, str, np.ndarray]]:
 
 
 def _seconds(cells: np.ndarray, unit: str) -> np.ndarray | None:
-    """Return the times [s] in a column: numbers in a unit of `TIMES`, or dates in ISO 8601; None for other columns."""
+    """Return the times [s] in a column: numbers in a unit of `TIMES`, or dates in ISO 8601; None for other columns.
+
+    Args:
+        cells: (m,) cells of the column.
+        unit: unit in the column's header.
+    """
     if cells.dtype == float:
         return TIMES[unit] * cells if unit in TIMES and np.isfinite(cells).all() else None
     try:

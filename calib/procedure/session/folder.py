@@ -138,8 +138,10 @@ class Session:
         return older if older.exists() else self.folder / name
 
     def named(self, name: str) -> Path | None:
-        """Return the path of a file whose name is the value of a key in ``session.toml``; None if
-        the value is empty.
+        """Return the path of a file that a key in ``session.toml`` names.
+
+        Args:
+            name: value of the key; empty: there is no file, and None is returned.
         """
         return self.path(name) if name else None
 
@@ -317,6 +319,10 @@ def create(folder: Path, robot_file: Path, settings: SessionSettings, copied: Ma
 
 def open_session(folder: Path, plots: bool = True) -> Session:
     """Read the settings of the session in a folder.
+
+    Args:
+        folder: the folder.
+        plots: whether the session's steps draw figures.
 
     Raises:
         SessionError: if the folder is not a session, was made by a newer version, or has a damaged ``session.toml``.
