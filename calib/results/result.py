@@ -1,8 +1,9 @@
 """The protocol of results: `Result`, which results in memory and stored results implement.
 
-Commands that take a result open it (`calib.results.registry.open_result`) and call its methods. `StoredResult` is the
-class of all kinds in folders; a kind with additional functions has a subclass. If a kind does not support a method, the
-method raises an error with advice on the folder or command to use instead (`calib.result_kinds`).
+Commands that take a result open it (`calib.results.result_classes.open_result`) and call its methods.
+`StoredResult` is the class of all kinds in folders; a kind with additional functions has a subclass. If a kind does not
+support a method, the method raises an error with advice on the folder or command to use instead
+(`calib.result_kinds`).
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.apps.cell_demo.summary import Telling, row
+from calib.apps.cell_demo.step_lines import Telling, row
 from calib.errors import SessionError, UsageError, command_line
 from calib.folders import read_estimate
 from calib.records import read_lines
@@ -146,7 +146,7 @@ def run(
     cell = virtual_cell(robot, seed)
     if dynamics and cell.nominal.inertias is None:
         supported = ", ".join(name for name in robot_names() if load(name).inertias is not None)
-        say(f"geometry only: masses are known of {supported}")
+        say(f"geometry only: masses are known for {supported} only")
         dynamics = False
     motion: dict[str, Any] = {}
     if dynamics:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib import files
-from calib.apps.cell_demo.summary import PICTURE
+from calib.apps.cell_demo.step_lines import PICTURE
 from calib.toolkit.report_charts import (
     AFTER,
     BEFORE,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.apps.monitoring import pages
+from calib.apps.monitoring import report_folder
 from calib.apps.monitoring.comparison.change_part import plus_minus
 from calib.apps.monitoring.comparison.change_test import ParameterChange
 from calib.apps.monitoring.comparison.geometry_change import GeometryChange
@@ -155,7 +155,7 @@ class RobotLog(ChartedResult, ReportedResult, WithoutVerdict):
         ]
         panels = [
             Panel(errors_drawn, "error on unseen poses [mm]", xnames=dates),
-            Panel(motion_drawn, "the tool moved since the one before [mm]", xnames=dates),
+            Panel(motion_drawn, "motion of the tool since the last calibration [mm]", xnames=dates),
         ]
         return {"log": Chart(panels, 2.6, 2)}
 
@@ -172,11 +172,13 @@ class RobotLog(ChartedResult, ReportedResult, WithoutVerdict):
         if plots:
             charts = self.charts()
         rows = [log_line.row(self.robot) for log_line in self.lines]
-        part = pages.ResultPart(self.section(), charts, ["Errors, and motion of the tool."], (TABLE, HEADER, rows))
+        part = report_folder.ResultPart(
+            self.section(), charts, ["Errors, and motion of the tool."], (TABLE, HEADER, rows)
+        )
         lines = [dict(zip(HEADER, row)) for row in rows]
         numbers = plain({"robot": self.robot, "lines": lines})
         title = f"Calibrations of {self.robot}"
-        return pages.save(Path(out), "log", title, {"robot": self.robot}, [part], numbers, [TABLE])
+        return report_folder.save(Path(out), "log", title, {"robot": self.robot}, [part], numbers, [TABLE])
 
 
 def _nominal_error(log_line: LogLine) -> str:
@@ -255,7 +257,7 @@ def _check_same(attribute: str, names: Sequence[str], mixed: bool) -> None:
         mixed: whether different ones are accepted.
     """
     different = list(dict.fromkeys(name for name in names if name))
-    message = f"the sessions have different {attribute} ({', '.join(different)}); --mixed takes them for one robot"
+    message = f"the sessions have different {attribute} ({', '.join(different)}); give --mixed if they are of one robot"
     require(len(different) < 2 or mixed, message, UsageError)
 
 

@@ -69,7 +69,9 @@ class Guard:
         """Return the response to a refused request, or to one that sets the token's cookie; None for other requests."""
         requested_host = request.headers.get("host", "")
         if not self._is_ours(requested_host):
-            return PlainTextResponse("This page is not served under that name: use the address printed.", 403)
+            return PlainTextResponse(
+                "This page is not served under this host name: open the address that calib serve printed.", 403
+            )
         if request.method != "GET":
             origin = request.headers.get("origin")
             other_origin = origin is not None and urlsplit(origin).netloc != requested_host
@@ -160,20 +162,23 @@ def page(request: Request) -> Response:
     if session.path(RECORDING).exists():
         recording = RECORDING
     paths = _files(session)
+    tasks = [re.sub(r"^\d+ ", "", line) for line in task.splitlines()]
+    pictures = [_name(session, path) for path in paths if path.suffix in PICTURES]
+    file_names = [_name(session, path) for path in paths]
     values = {
         "session": session,
         "states": states,
         "ahead": ahead,
         "work": work,
         "to_bring": to_bring,
-        "tasks": [re.sub(r"^\d+ ", "", line) for line in task.splitlines()],
+        "tasks": tasks,
         "verdicts": verdicts,
         "kinds": _kinds(session),
         "notes": _notes(session),
         "pages": _pages(session),
         "recording": recording,
-        "pictures": [_name(session, path) for path in paths if path.suffix in PICTURES],
-        "files": [_name(session, path) for path in paths],
+        "pictures": pictures,
+        "files": file_names,
     }
     headers = {"Content-Security-Policy": POLICY, "Cache-Control": "no-store"}
     return HTMLResponse(filled(TEMPLATES, "page.html", **values), headers=headers)
@@ -267,7 +272,7 @@ async def bring(request: Request) -> Response:
     kind = request.path_params["kind"]
     session = open_session(work.folder)
     if kind not in [name for name, _, _ in _kinds(session)]:
-        return PlainTextResponse("this session takes no such files", 404)
+        return PlainTextResponse("this session does not accept such files", 404)
     try:
         await uploads.receive(session, kind, request.headers.get("content-type", ""), request.stream())
     except ClientDisconnect:

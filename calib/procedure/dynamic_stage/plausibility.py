@@ -211,10 +211,19 @@ def another_loop(disagreement: LoopDisagreement | None) -> list[Finding]:
     """
     if disagreement is None:
         return []
-    factors, median = np.array(disagreement.factor), float(np.median(disagreement.factor))
-    # one factor at all joints, or one at each, or else another velocity
-    scaled = bool(np.ptp(factors) < MAX_FACTOR_SPREAD * abs(median) and abs(median - 1.0) > MIN_FACTOR_ERROR)
-    by_joint = not scaled and bool(np.any(np.abs(factors - 1.0) > MIN_FACTOR_ERROR))
+    factors = np.array(disagreement.factor)
+    median = float(np.median(factors))
+    equal_factors = np.ptp(factors) < MAX_FACTOR_SPREAD * abs(median)
+    # Hypotheses: one factor at all joints, a factor per joint, or else another velocity than the stated one.
+    times = None
+    wrong_factors: list[str] = []
+    velocity = ""
+    if equal_factors and abs(median - 1.0) > MIN_FACTOR_ERROR:
+        times = median
+    elif np.any(np.abs(factors - 1.0) > MIN_FACTOR_ERROR):
+        wrong_factors = _three_digits(disagreement.factor)
+    else:
+        velocity = "reference_velocity"
     return [
         finding(
             "loop-refuted",
@@ -225,9 +234,9 @@ def another_loop(disagreement: LoopDisagreement | None) -> list[Finding]:
             worst=max(disagreement.left),
             left=_three_digits(disagreement.left),
             other_left=_three_digits(disagreement.beside_left),
-            times=median if scaled else None,
-            factors=_three_digits(disagreement.factor) if by_joint else (),
-            velocity="" if scaled or by_joint else "reference_velocity",
+            times=times,
+            factors=wrong_factors,
+            velocity=velocity,
         )
     ]
 

@@ -21,8 +21,8 @@ from calib.trajectories.basis import Family, SampledMotion
 from calib.trajectories.constraints import BoxLimit
 from calib.trajectories.design.search import SearchResult
 from calib.trajectories.design.verify import dense_motion
-from calib.trajectories.places import Clearance
 from calib.trajectories.setpoints import Setpoints, joined, slowed
+from calib.trajectories.workspace_limits import Clearance
 
 # [1/s, 1/s^2] acceleration and jerk of an approach over its speed, where none is stated
 APPROACH_RISE = DEFAULT_RISE

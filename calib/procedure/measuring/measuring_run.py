@@ -29,7 +29,7 @@ from calib import files
 from calib.data.poses.pose_lists import joint_columns
 from calib.poses.by_index import merits
 from calib.poses.indices import Index, observability
-from calib.poses.information import log_det
+from calib.poses.scaled_jacobians import log_det
 from calib.procedure.measuring import DEFAULT_RUN, RunSettings
 from calib.robot.chain import Chain
 from calib.trajectories.tour import move_times, tour

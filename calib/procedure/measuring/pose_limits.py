@@ -20,7 +20,7 @@ from calib.config_types import number
 from calib.errors import RobotError, UsageError, listing, one_of, refused_as, require
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, TargetJacobian, TargetPose
-from calib.poses import constraints
+from calib.poses import pose_constraints
 from calib.poses.space import PoseConstraint, SearchSpace
 from calib.procedure.measuring import constraints_file
 from calib.procedure.measuring.camera_view import camera_view
@@ -343,11 +343,11 @@ def _target(settings: ConstraintsFile, cell: Installation) -> list[PoseConstrain
     result = []
     low, high = table.heights
     if low is not None:
-        result.append(constraints.height(target, low, np.inf if high is None else high, jacobian))
+        result.append(pose_constraints.height(target, low, np.inf if high is None else high, jacobian))
     if table.axis_distance is not None:
-        result.append(constraints.axis_distance(target, table.axis_distance, jacobian))
+        result.append(pose_constraints.axis_distance(target, table.axis_distance, jacobian))
     if table.reach is not None:
-        result.append(constraints.reach(target, table.reach, jacobian=jacobian))
+        result.append(pose_constraints.reach(target, table.reach, jacobian=jacobian))
     return result
 
 
@@ -358,7 +358,7 @@ def _orientation(settings: ConstraintsFile, cell: Installation, where: str) -> l
     stand = placement(table.stated, where)
     roll = _span(table.roll or (-np.pi, np.pi), f"{where}.roll", "angle")
     pitch = _span(table.pitch or (-np.pi / 2, np.pi / 2), f"{where}.pitch", "angle")
-    return [constraints.orientation(TargetPose(cell), stand[:3, :3], roll, pitch, TargetJacobian(cell))]
+    return [pose_constraints.orientation(TargetPose(cell), stand[:3, :3], roll, pitch, TargetJacobian(cell))]
 
 
 def _sight(settings: ConstraintsFile, cell: Installation, where: str, model: DistanceModel | None) -> Sight | None:

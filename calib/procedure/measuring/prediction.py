@@ -22,7 +22,7 @@ from calib.geometry.weighing import GeometricFit
 from calib.poses.design import Pool
 from calib.poses.errors import NotIdentifiable, TooFewCandidates
 from calib.poses.exchange import greedy
-from calib.poses.information import prepared
+from calib.poses.scaled_jacobians import prepared
 from calib.records import Array, read_json
 
 SUFFIX = "_prediction.json"
@@ -60,7 +60,7 @@ class SelectionPrediction:
             selection_joints = ", ".join(self.joints)
             raise UsageError(
                 f"the selection belongs to another robot: its joints are {selection_joints}; "
-                f"this robot has {', '.join(joints)}"
+                f"this robot has {', '.join(joints)}: choose poses for it"
             )
 
 
@@ -173,7 +173,7 @@ def table(prediction: Prediction, by_pose_count: tuple[Prediction, ...]) -> list
     label = "predicted σ of the tool's position"
     if not np.isfinite(prediction.rms):
         return [(label, "not available: these poses do not identify all parameters")]
-    rows = [(label, f"{1e3 * prediction.rms:.3g} mm rms, {1e3 * prediction.worst:.3g} mm at 95 %")]
+    rows = [(label, f"{1e3 * prediction.rms:.3g} mm rms, {1e3 * prediction.worst:.3g} mm at 95 %, by noise alone")]
     sigmas = []
     for unit, quantity, printed_unit in QUANTITIES:
         indices = [k for k, parameter_unit in enumerate(prediction.units) if parameter_unit == unit]

@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, TargetJacobian, TargetPose
-from calib.poses import constraints
+from calib.poses import pose_constraints
 from calib.poses.space import PoseConstraint, constraint_gradient
 from calib.robot.capsules import ALWAYS, SAMPLES
 from calib.robot.chain import Chain, random_joints
@@ -172,9 +172,9 @@ def sight_of(
         velocity = TargetJacobian(cell, number)
         parts: list[PoseConstraint] = []
         if half_angle is not None:
-            parts.append(constraints.line_of_sight(target, instrument, direction, half_angle, velocity))
+            parts.append(pose_constraints.line_of_sight(target, instrument, direction, half_angle, velocity))
         if nearest > 0.0 or np.isfinite(largest):
-            parts.append(constraints.distance(target, nearest or -np.inf, largest, instrument, velocity))
+            parts.append(pose_constraints.distance(target, nearest or -np.inf, largest, instrument, velocity))
         if arm is not None:
             links = _blocking_links(arm, cell.chain, target)
             behind = _Behind(arm, target, velocity, np.asarray(instrument, dtype=float), links)

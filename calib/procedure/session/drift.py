@@ -141,20 +141,26 @@ def repeats(
         again: measurements from files whose names start with drift.
         sigma: σ of one position, per axis [m]; 0: unknown, so that the drift is stated but not judged.
     """
-    pairs = [(later.file, "again at the end", drift_of(chain, later, blocks)) for later in again]
-    pairs += [(block.file, "more than once", drift_of(chain, block)) for block in blocks]
-    return [
-        finding(
-            "poses-moved" if sigma and found.exceeds(sigma) else "poses-repeat",
+    drifts = [(later.file, "again at the end", drift_of(chain, later, blocks)) for later in again]
+    drifts += [(block.file, "more than once", drift_of(chain, block)) for block in blocks]
+    noise = None
+    if sigma:
+        noise = noise_of_difference(sigma)
+    findings = []
+    for file, when, drift in drifts:
+        if drift is None:
+            continue
+        beyond_noise = bool(sigma) and drift.exceeds(sigma)
+        drift_finding = finding(
+            "poses-moved" if beyond_noise else "poses-repeat",
             file=Path(file).name,
             when=when,
-            poses=found.poses,
-            rms=found.rms,
-            noise=noise_of_difference(sigma) if sigma else None,
+            poses=drift.poses,
+            rms=drift.rms,
+            noise=noise,
         )
-        for file, when, found in pairs
-        if found is not None
-    ]
+        findings.append(drift_finding)
+    return findings
 
 
 def drift_of(chain: Chain, later: PoseMeasurements, first: Sequence[PoseMeasurements] | None = None) -> Drift | None:

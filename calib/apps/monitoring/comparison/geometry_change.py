@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.apps.monitoring.comparison.calibrations import Calibration
 from calib.apps.monitoring.comparison.change_test import ChangeTest, ParameterChange, Tested, span, tested
+from calib.apps.monitoring.comparison.geometry_calibration import Calibration
 from calib.apps.monitoring.settings import DiffSettings
 from calib.errors import UsageError, require
 from calib.toolkit.chains import evaluate, random_joints

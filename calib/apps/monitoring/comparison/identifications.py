@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import folders
-from calib.apps.monitoring.comparison.places import Place, check_same_robot
+from calib.apps.monitoring.comparison.calibration_sources import Place, check_same_robot
 from calib.errors import UsageError, require
 from calib.toolkit.chains import CalibratedChain, read_calibrated
 from calib.toolkit.pose_data import read_table

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from calib import files, folders
-from calib.apps.fleet import prior
-from calib.apps.fleet.prior import ParameterSpread
+from calib.apps.fleet import arm_distribution
+from calib.apps.fleet.arm_distribution import ParameterSpread
 from calib.apps.fleet.tools import MIN_ARMS, MIN_TIMES, ToolUse, tools
 from calib.apps.fleet.visits import visits
-from calib.apps.monitoring.comparison.calibrations import Calibration
+from calib.apps.monitoring.comparison.calibration_sources import check_same_robot
+from calib.apps.monitoring.comparison.geometry_calibration import Calibration
 from calib.apps.monitoring.comparison.geometry_change import ToolMotion
-from calib.apps.monitoring.comparison.places import check_same_robot
 from calib.apps.monitoring.comparison.robot_change import RobotChange, diff
 from calib.arguments import checked
 from calib.errors import Finding, RobotError, counted, finding
@@ -87,7 +87,7 @@ class FleetReport(ReportedResult):
             RecordColumn("from", _earlier_folder, False),
             RecordColumn("to", _later_folder, False),
             RecordColumn("tool moved, mm rms", _moved_mm),
-            RecordColumn("σ of that", _expected_mm),
+            RecordColumn("expected from σ", _expected_mm),
             RecordColumn("p", "{0[1].geometry.probability:.1g}"),
             RecordColumn("", "{0[1].verdict.level}", number=False),
         ]
@@ -116,7 +116,7 @@ class FleetReport(ReportedResult):
         for arm_type in self.types:
             if arm_type.parameters:
                 robots = [arm.robot for arm in arm_type.plausible]
-                prior.write(out / PRIOR / arm_type.name, robots, arm_type.parameters)
+                arm_distribution.write(out / PRIOR / arm_type.name, robots, arm_type.parameters)
         return out
 
     def _write(self, folder: Path) -> None:
@@ -178,9 +178,9 @@ def _tables(arm_type: ArmType) -> list[Block]:
     parameters = [
         RecordColumn("parameter", "{0.name}", number=False),
         RecordColumn("arms", "{0.arms}"),
-        RecordColumn("mean", lambda row: small(row.mean, row.unit, 3)),
-        RecordColumn("sigma", lambda row: small(row.sigma, row.unit, 3)),
-        RecordColumn("width", lambda row: small(row.width, row.unit, 3)),
+        RecordColumn("mean", _mean),
+        RecordColumn("sigma", _sigma),
+        RecordColumn("width", _width),
     ]
     tool_columns = [
         RecordColumn("tool", "{0.tool}", number=False),
@@ -203,6 +203,18 @@ def _tables(arm_type: ArmType) -> list[Block]:
         table(f"Tools of {arm_type.name}", tool_columns, compared),
         table(f"Parameters of {arm_type.name}", parameters, arm_type.parameters, note),
     ]
+
+
+def _mean(row: ParameterSpread) -> str:
+    return small(row.mean, row.unit, 3)
+
+
+def _sigma(row: ParameterSpread) -> str:
+    return small(row.sigma, row.unit, 3)
+
+
+def _width(row: ParameterSpread) -> str:
+    return small(row.width, row.unit, 3)
 
 
 def _arm_count(row: ToolUse) -> str:
@@ -323,7 +335,7 @@ def _arm_type(name: str, arms: Sequence[Calibration]) -> ArmType:
             robots.append(arm.robot)
     parameters: tuple[ParameterSpread, ...] = ()
     if robots:
-        parameters = prior.spread(robots)
+        parameters = arm_distribution.spread(robots)
     return ArmType(name, tuple(arms), tuple(failed), tuple(odd), parameters, tuple(tools(tool_uses)))
 
 

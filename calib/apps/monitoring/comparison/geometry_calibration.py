@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from calib.apps.monitoring.comparison.places import Place, check_same_robot
+from calib.apps.monitoring.comparison.calibration_sources import Place, check_same_robot
 from calib.toolkit.chains import CalibratedChain, Chain, Deflection, load_calibrated, read_calibrated
 from calib.toolkit.installations import Installation, layout, read_installation
 from calib.toolkit.result_folders import ComparedRows, FitMetrics, read_covariance
