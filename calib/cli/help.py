@@ -19,10 +19,9 @@ _WORDS = {int: "N", float: "NUMBER", Path: "PATH"}
 
 
 def type_word(kind: object, choices: tuple[str, ...] | str = ()) -> str | None:
-    """Return the text for an option's value in the help: the allowed texts if they are short, otherwise a word for the
-    type.
+    """Return the word for an option's value in the help text; None for a flag, which has no value.
 
-    None for a flag, which has no value.
+    It lists the allowed texts if they are short, otherwise it names the type.
 
     Args:
         kind: type of the option's value.

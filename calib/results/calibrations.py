@@ -35,8 +35,7 @@ class CalibratedRobot(Viewed):
         stage_of(self.path, verb)
 
     def export(self, into: Path, settings: ExportSettings) -> Exported:
-        """Write the robot for other programs: all file formats into a folder, or a ROS 2 package into a folder below
-        it.
+        """Write the robot for other programs, in all file formats or as a ROS 2 package.
 
         Args:
             into: folder to write into, which is created if necessary.

@@ -22,8 +22,7 @@ FRAMES = 50.0
 
 @runtime_checkable
 class Drawn(Protocol):
-    """A robot that is not a serial arm, as its command ``view`` (`calib.procedure.robot_kinds.CommandStage`) returns
-    it.
+    """A robot to draw that is not a serial arm, as the command ``view`` of its kind returns it.
 
     Attributes:
         n, joints, joint_names: number, properties and names of the actuated joints.

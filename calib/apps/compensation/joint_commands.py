@@ -567,7 +567,10 @@ def _turn_note(fitted: Fitted, dof: int) -> list[Finding]:
 
 
 def _unreached(commands: Commands) -> list[str]:
-    """Return one line for each target that is not reached, with the reason; at most `MAX_LISTED` lines."""
+    """Return one line for each target that the joint commands do not reach, with the reason.
+
+    At most `MAX_LISTED` lines are returned.
+    """
     lost = np.flatnonzero(~commands.reached)
     result = [f"target {k + 1}: {commands.reason[k]}" for k in lost[:MAX_LISTED]]
     if len(lost) > MAX_LISTED:
@@ -611,7 +614,13 @@ def write(commands: Commands, out: Path, partial: bool = False) -> Path:
 
 
 def lines(commands: Commands) -> list[str]:
-    """Return the console lines: notes on frames, targets that are not reached, errors before and after compensation."""
+    """Return the console lines on joint commands.
+
+    They are notes on frames, targets that are not reached, and errors before and after compensation.
+
+    Args:
+        commands: the joint commands.
+    """
     reached, targets, fitted = commands.reached, commands.targets, commands.fitted
     result = [*commands.notes, *targets.notes]
     if targets.ignored:
@@ -643,7 +652,7 @@ def lines(commands: Commands) -> list[str]:
 
 
 def _expectation(commands: Commands) -> Finding:
-    """Return the finding on the real arm's expected error at these targets.
+    """Return the finding on the position error to be expected of the real arm at the targets of joint commands.
 
     The error is that of the error model, or, without a model, the rms error at held-out poses.
     """

@@ -138,7 +138,7 @@ class Configuration:
 
 
 def has_spherical_wrist(chain: Chain) -> bool:
-    """Return whether an arm has six revolute joints of which the last three axes intersect in a point.
+    """Return whether the arm `chain` has six revolute joints of which the last three axes intersect in a point.
 
     Configurations are defined for such arms only.
     """

@@ -217,6 +217,9 @@ def table(outcomes: Sequence[FleetRow]) -> RenderableType:
     """Return the summary table, one line per robot, with errors at held-out poses and torque on held-out motions.
 
     The columns are state, verdict, rms position errors [mm], unexplained share of the torque [%] and time [s].
+
+    Args:
+        outcomes: outcome of each session.
     """
     summary_table = Table("session", "state", "verdict", box=None, pad_edge=False)
     for name in ("nominal mm", "calibrated mm", "torque %", "s"):
@@ -243,7 +246,11 @@ def table(outcomes: Sequence[FleetRow]) -> RenderableType:
 
 
 def remarks(outcomes: Sequence[FleetRow]) -> Iterator[str]:
-    """Yield a line for each unfinished session: the file for which the session waits, or the error message."""
+    """Yield a line for each unfinished session: the file for which the session waits, or the error message.
+
+    Args:
+        outcomes: outcome of each session.
+    """
     beginnings = {WAITS: "{} waits for ", FAILED: "{} failed: "}
     for row in outcomes:
         if row.state == DONE:
@@ -253,7 +260,12 @@ def remarks(outcomes: Sequence[FleetRow]) -> Iterator[str]:
 
 
 def summary(outcomes: Sequence[FleetRow], seconds: float) -> str:
-    """Return one line with the number of sessions in each state, the number with each verdict, and the total time."""
+    """Return one line with the number of sessions in each state, the number with each verdict, and the total time.
+
+    Args:
+        outcomes: outcome of each session.
+        seconds: the total time [s].
+    """
     states = Counter(row.state for row in outcomes)
     verdicts = Counter(row.verdict for row in outcomes)
     finished = f"{states[DONE]} of {len(outcomes)} done"

@@ -227,7 +227,13 @@ def _displacement_mm(row: ToolUse) -> str:
 
 
 def _error_sigmas(row: ToolUse) -> str:
-    """Return as text how many σ the errors with a tool exceed those with other tools; empty where they do not."""
+    """Return as text how many σ the errors with a tool exceed those with other tools.
+
+    Empty if they do not exceed them.
+
+    Args:
+        row: comparison of arms with the tool against arms with other tools.
+    """
     assert row.times is not None
     if row.times > MIN_TIMES:
         return f"{row.times_sigmas:.1f}"

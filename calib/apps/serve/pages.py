@@ -143,7 +143,7 @@ def refused(request: Request, error: Exception) -> Response:
 
 
 def page(request: Request) -> Response:
-    """Return the page with the session's current state."""
+    """Return the page with the current state of the session."""
     work: Work = request.app.state.work
     session = open_session(work.folder)
     states = step_states(session)
@@ -221,12 +221,12 @@ def _files(session: Session) -> list[Path]:
 
 
 def script(request: Request) -> Response:
-    """Return the page's script; the page works without it."""
+    """Return the page's script; the page also works without the script."""
     return FileResponse(Path(__file__).with_name("page.js"))
 
 
 def file(request: Request) -> Response:
-    """Return a file of the session's folder."""
+    """Return the file of the session's folder that the request's path names."""
     session = open_session(request.app.state.work.folder)
     path = session.folder / request.path_params["name"]
     if path not in _files(session) or not path.resolve().is_relative_to(session.folder.resolve()):
@@ -267,7 +267,7 @@ def go_on(request: Request) -> Response:
 
 
 async def bring(request: Request) -> Response:
-    """Store uploaded files in the session's folder, and queue their check."""
+    """Store the files of an uploaded form in the session's folder, and queue their check."""
     work = request.app.state.work
     kind = request.path_params["kind"]
     session = open_session(work.folder)
@@ -282,7 +282,7 @@ async def bring(request: Request) -> Response:
 
 
 def set_aside(request: Request) -> Response:
-    """Move an uploaded file into the subfolder ``aside``, where the session does not read it."""
+    """Move the uploaded file that the request names into the subfolder ``aside``, where the session does not read it."""
     work = request.app.state.work
     name = request.path_params["name"]
     session = open_session(work.folder)

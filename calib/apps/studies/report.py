@@ -276,7 +276,11 @@ def condition_table(summary: ConditionSummary, names: Sequence[str] = ON_CONSOLE
 
 
 def failures(summary: ConditionSummary) -> list[Text]:
-    """Return the failures of each method on a condition: kind, number, and first message; an empty list without any."""
+    """Return the failures of each method on a condition: kind, number, and first message; an empty list without any.
+
+    Args:
+        summary: summary of the condition.
+    """
     lines = []
     for method in sorted(summary.methods, key=attrgetter("method")):
         for status, count in method.failures.items():

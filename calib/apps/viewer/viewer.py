@@ -303,7 +303,14 @@ def _chosen(
 
 
 def _played(recording: RecordingStream, scene: Scene, played: Played, start: float) -> float:
-    """Log a motion and its limits from time `start` [s] on; return the start time of the next part [s]."""
+    """Log a motion and its limits; return the start time of the next part [s].
+
+    Args:
+        recording: the recording.
+        scene: the scene, which contains the robot.
+        played: the motion.
+        start: time at which this part begins [s].
+    """
     t = start + played.t - played.t[0]
     samples = thinned(played.t)
     index = [rr.TimeColumn("time", duration=t[samples])]
@@ -438,7 +445,7 @@ def _arm(recording: RecordingStream, scene: Scene, index: list[TimeColumn], q: n
 
 
 def _meshes(recording: RecordingStream, scene: Scene) -> None:
-    """Log each mesh once, attached to the frame of its link."""
+    """Log each mesh of a scene's robot once, attached to the frame of its link."""
     for number, mesh in enumerate(scene.meshes):
         entity = f"world/robot/links/{_part(mesh.link)}/mesh_{number}"
         position = mesh.placement[:3, 3]
@@ -448,7 +455,7 @@ def _meshes(recording: RecordingStream, scene: Scene) -> None:
 
 
 def _blueprint(scene: Scene) -> Any:
-    """Return the initial layout of the recording: the arm on the left, plots and text on the right."""
+    """Return the initial layout of the recording of a scene: the arm on the left, plots and text on the right."""
     import rerun.blueprint as rrb
 
     tabs: list[Any] = []

@@ -138,7 +138,7 @@ class IdentificationFolder:
 
 
 def _number_of_table(path: Path) -> int:
-    """Return the number in the name of a table of torques, torques_12.csv."""
+    """Return the number in the file name of a table of torques, such as 12 for ``torques_12.csv``."""
     return int(path.stem.rpartition("_")[2])
 
 

@@ -37,8 +37,7 @@ REPEAT = 0.5
 
 @dataclass(frozen=True, eq=False)
 class ModelFindings:
-    """Findings on an identified model that the verdict needs in addition to the recordings; stored in the model's
-    folder.
+    """Findings on an identified model, stored in the model's folder; the verdict needs them besides recordings.
 
     Attributes:
         rests: parameters whose values are determined by a prior instead of the recordings.

@@ -61,8 +61,7 @@ def replay(
     controller: LoopController | None = None,
     rate: float | None = None,
 ) -> Replay:
-    """Return simulated tracking errors on a recorded motion with four feedforwards: none, CAD model, model, measured
-    torque.
+    """Return simulated tracking errors on a recorded motion with four kinds of feedforward torque.
 
     Args:
         chain: arm, with CAD inertias if its description has any.

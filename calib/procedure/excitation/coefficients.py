@@ -73,8 +73,9 @@ Numbers = Annotated[tuple[float, ...], Expect("a list of finite numbers")]
 
 @dataclass(frozen=True)
 class _JointTable:
-    """Entry ``[[joint]]`` of ``trajectory.toml``: coefficients of one joint; the module's docstring
-    explains the keys.
+    """Entry ``[[joint]]`` of ``trajectory.toml``: coefficients of one joint.
+
+    The module's docstring explains the keys.
     """
 
     name: Name
@@ -99,8 +100,7 @@ class TrajectoryFile:
 
 @dataclass(frozen=True, eq=False)
 class Periodic:
-    """A periodic motion, defined by the coefficients of a Fourier series (eq. 23 of Kolyubin et al. 2019) or of a
-    spline.
+    """A periodic motion, defined by the coefficients of a Fourier series or of a spline.
 
     Attributes:
         joint_names, kinds: (n,) names and kinds (revolute, prismatic) of the joints.

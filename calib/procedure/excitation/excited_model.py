@@ -65,8 +65,7 @@ def read_model(
     loads: Sequence[str] = (),
     nominal: Chain | None = None,
 ) -> ExcitedModel:
-    """Return the model to excite: from an identification's folder, or from the robot's inertias and the stated
-    friction.
+    """Return the model to excite, of an identification, or of the robot's inertias and the stated friction.
 
     Args:
         chain: the arm.

@@ -399,7 +399,13 @@ def write(chosen: Chosen, path: Path) -> Path:
 
 
 def bound_words(selection: Selection) -> str:
-    """Return a text on the efficiency's bound: the set of poses to which it applies, and its accuracy."""
+    """Return a text on the bound of a selection's efficiency.
+
+    It names the set of poses to which the bound applies, and the bound's accuracy.
+
+    Args:
+        selection: the selected poses with their efficiency.
+    """
     ceiling = selection.ceiling
     if ceiling.climbs:
         percent = 100 * ceiling.gap

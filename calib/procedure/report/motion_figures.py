@@ -33,8 +33,7 @@ TITLES = ("position", "velocity", "acceleration", "torque")
 
 
 def motion_sheet(times: np.ndarray, series: Sequence[Limited], joints: Sequence[Joint]) -> Chart:
-    """Return a chart of the joint motion over time, with one row per joint and one column per quantity; limits are
-    dashed.
+    """Return a chart of the joint motion over time, with a row per joint and a column per quantity.
 
     Args:
         times: (N,) times [s].
@@ -171,8 +170,9 @@ def write_plan(planned: Planned, folder: Path) -> None:
 
 
 def _plan_figure(planned: Planned) -> Chart:
-    """Return a chart of each joint's position, velocity, acceleration and torque in a planned motion; limits are
-    dashed.
+    """Return a chart of each joint's position, velocity, acceleration and torque in a planned motion.
+
+    Limits are dashed.
     """
     track, limits = planned.track, planned.limits
     series: list[Limited] = [

@@ -194,8 +194,7 @@ def drift_of(chain: Chain, later: PoseMeasurements, first: Sequence[PoseMeasurem
 def trends(
     chain: Chain, blocks: Sequence[PoseMeasurements], again: Sequence[PoseMeasurements] = (), sigma: float = 0.0
 ) -> list[Trend]:
-    """Return the target's motion with time and with each temperature in the files; an empty list without repeated
-    poses.
+    """Return the target's motion with time and with each temperature in the files; empty without repeated poses.
 
     Args:
         chain: the nominal arm.
@@ -263,8 +262,7 @@ def _trend(what: str, unit: str, x: np.ndarray, off: np.ndarray, pose: np.ndarra
 
 
 def _columns(path: Path, rows: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
-    """Return time [h] and temperatures [°C] of a file's rows: column name -> unit and values (m,); empty without
-    columns.
+    """Return time [h] and temperatures [°C] of a file's rows: column name -> unit and values (m,).
 
     Args:
         path: the file.

@@ -456,7 +456,15 @@ def validate(session: Session, say: Say) -> list[Note]:
 
 
 def _predicted_and_reached(session: Session, assessment: Assessment) -> list[Finding]:
-    """Return the findings that state the accuracy of the tool reached on held-out poses next to the predicted one."""
+    """Return the findings that state the reached accuracy of the tool next to the predicted one.
+
+    Args:
+        session: the session, whose selection of poses contains the predicted σ of the tool's position.
+        assessment: errors on held-out poses, whose rms is the reached accuracy.
+
+    Returns:
+        One finding for each set of held-out poses; an empty list without a prediction.
+    """
     path = session.path(folder.SELECTION)
     if not session.settings.poses.plan or not path.exists():
         return []
