@@ -282,7 +282,7 @@ async def bring(request: Request) -> Response:
 
 
 def set_aside(request: Request) -> Response:
-    """Move the uploaded file that the request names into the subfolder ``aside``, where the session does not read it."""
+    """Move the uploaded file of the request into the subfolder ``aside``, where the session does not read it."""
     work = request.app.state.work
     name = request.path_params["name"]
     session = open_session(work.folder)

@@ -79,8 +79,7 @@ def truncated(data: Triangles) -> np.ndarray:
 
     Args:
         data: triangular factors R of the regression's rows (Rᵀ R: normal equations), one group per torque row; each
-            group is weighted by the inverse rms of its
-            residuals.
+            group is weighted by the inverse rms of its residuals.
     """
     weight, values = np.ones(data.groups), np.zeros(data.parameters)
     for _ in range(ROUNDS):
