@@ -77,7 +77,8 @@ class BSpline:
     def largest(self, x: np.ndarray, order: int) -> np.ndarray:
         """Return a bound (n,) on abs(d^r q / dt^r): the largest control point of the r-th derivative, r = `order`.
 
-        The derivative of a uniform spline is a spline one degree lower with control points Δc / h (de Boor), and a
+        The derivative of a uniform spline is a spline one degree lower with control points Δc / h (differences of
+        neighbouring control points by the knot spacing; de Boor 1978), and a
         spline lies in the convex hull of its control points.
 
         Args:

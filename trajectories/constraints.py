@@ -147,8 +147,9 @@ class TorqueLimit(TwoSided):
     """Torque limit |Y χ| + k √(y Σ yᵀ) ≤ (1 - margin) τ_max, with y a row of Y and k σ of the torque as a margin.
 
     Attributes:
-        regressor: (q, v, a) -> observation matrix Y (N, n, b).
-        product: derivative product of the regressor, (q, v, a, G (N, n, b)) -> slopes of Σ G · Y in q, v, a.
+        regressor: (q, v, a) -> observation matrix Y (N, n, b); torques are Y χ.
+        product: derivative product of the regressor, (q, v, a, G (N, n, b)) -> gradients of Σ G · Y by q, v, a, each
+            (N, n).
         parameters: (b,) dynamic parameters χ.
         limits: (n,) τ_max [N m or N]; infinite where there is none.
         covariance: (b, b) covariance Σ of χ; None takes χ as exact.

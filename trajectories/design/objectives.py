@@ -44,7 +44,7 @@ class Value(NamedTuple):
         by_motion: (4, N, n) gradient by q, v, a, jerk; None where the objective does not depend on them.
         by_duration: gradient by the duration of the motion [1/s].
         exact: value of the objective without smoothing.
-        by_information: (c, c) gradient ∂F/∂M of an index of the information matrix; empty for other objectives.
+        by_information: (c, c) gradient of an excitation index by the information matrix; empty for other objectives.
     """
 
     value: float
@@ -60,7 +60,7 @@ class Observed(NamedTuple):
 
     Attributes:
         W: (n N, c) weighted observation matrix, joint after joint.
-        M: (c, c) information matrix Wᵀ W + M_existing.
+        M: (c, c) information matrix Wᵀ W, plus that of motions recorded before.
         shape: shape (N, n, b) of the regressor.
         sigmas: (n,) standard deviations of the torques; None takes 1.
         columns: indices of the regressor's b columns that are in W.
@@ -73,10 +73,12 @@ class Observed(NamedTuple):
     columns: np.ndarray | slice
 
     def by_regressor(self, by_information: np.ndarray) -> np.ndarray:
-        """Return the gradient ∂F/∂regressor (N, n, b) = 2 W S, divided by the standard deviations `sigmas`.
+        """Return the gradient (N, n, b) of an excitation index by the regressor, from that by the information matrix.
+
+        With W the observation matrix, it is 2 W S, divided by the standard deviations `sigmas`.
 
         Args:
-            by_information: S = ∂F/∂M (c, c), symmetric gradient of an index F by the information matrix M.
+            by_information: S (c, c), symmetric gradient of the index by the information matrix.
         """
         count, n, b = self.shape
         slope = np.zeros((b, n, count))
@@ -93,8 +95,9 @@ class Excitation:
 
     Attributes:
         index: "cond", "logdet", "smallest" or "trace".
-        scaling: "raw", "normalised", or (b,) scales by which the columns are divided.
-        sharpness: p of the smoothing; infinite for no smoothing.
+        scaling: "raw", "normalised", or (b,) scales by which the regressor's columns are divided.
+        sharpness: p of the smoothing, which replaces the largest eigenvalue by (Σ λ^p)^(1/p); infinite for no
+            smoothing.
         sigmas: (n,) standard deviations of the torques [N m or N]; None takes 1. An infinite value excludes the rows of
             that joint.
         existing: (b, b) information matrix of motions recorded before, computed with these sigmas; None for no such
@@ -161,7 +164,8 @@ class Excitation:
     def of_information(self, M: np.ndarray) -> tuple[float, np.ndarray, float]:
         """Return the index F of an information matrix M (c, c), its gradient S = ∂F/∂M, and F without smoothing.
 
-        With C = D M D, D = diag(M)^-1/2 (normalised): ∂F/∂M = D S_C D - diag((C S_C)_kk / M_kk).
+        With normalised columns, F is that of C = D M D, D = diag(M)^-1/2. With S_C the gradient by C, ∂F/∂M = D S_C D -
+        diag((C S_C)_kk / M_kk).
         """
         diagonal = np.diag(M)
         if not (diagonal > 0).all():
@@ -363,7 +367,8 @@ def condition_numbers(
 ) -> dict[str, float]:
     """Return the condition number of the observation matrix with raw and with normalised columns.
 
-    It is computed by SVD of the observation matrix, which is more accurate than by the eigenvalues of M.
+    It is computed by SVD of the observation matrix, which is more accurate than by the eigenvalues of the information
+    matrix.
 
     Args:
         regressor: (N, n, b) of a motion's N samples.

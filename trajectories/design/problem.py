@@ -24,12 +24,12 @@ INSTANTS = 2000  # over a period at which a motion is looked at between its samp
 
 @dataclass(frozen=True, eq=False)
 class AttainmentGoal:
-    """Goal F ≤ goal + weight · γ on an objective F.
+    """Goal F ≤ goal + weight · γ on an objective F, where γ, the largest miss of all goals, is minimised.
 
     Attributes:
         objective: F.
         goal: the value to attain.
-        weight: factor of γ; None takes |goal|; 0 makes the goal hard (a constraint).
+        weight: factor of γ; None takes |goal|, so that γ is a relative miss; 0 makes the goal hard (a constraint).
         words: wording of the goal in messages; empty for a wording made from name and value.
     """
 
@@ -60,9 +60,9 @@ class AttainmentGoal:
         return value
 
     def attainment(self, value: float) -> float:
-        """Return the γ at which the objective's `value` just meets the goal.
+        """Return the attainment γ, for which the objective's `value` equals goal + weight · γ.
 
-        For a hard goal, γ is −∞ where the value meets the goal, else ∞.
+        Negative: the goal is exceeded. For a hard goal, γ is −∞ where the value meets the goal, else ∞.
         """
         if self.share == 0:
             rounding = 1e-6 * max(abs(self.goal), 1e-3)
@@ -232,7 +232,8 @@ def evaluate(problem: ExcitationProblem, basis: Basis, y: np.ndarray, sharpness:
         problem: the problem.
         basis: result of `ExcitationProblem.basis`.
         y: (p + 1,) or (p,) the point: x (p,) are the family's free variables.
-        sharpness: p of the smoothed excitation indices and ρ of the smoothed constraints.
+        sharpness: exponent p of the smoothed excitation indices, and ρ of the smoothed maximum (1/ρ) log Σ exp(ρ g) of
+            the scaled constraints g.
     """
     x, factor = _variables(problem, y)
     motion = stretched(basis.motion(x), factor)
@@ -399,9 +400,14 @@ def exact_values(problem: ExcitationProblem, motion: SampledMotion, regressor: n
 
 
 def merit(problem: ExcitationProblem, values: np.ndarray) -> float:
-    """Return the merit to minimise from objective values (k,): γ for a problem with goals, else the weighted sum.
+    """Return the merit to minimise from objective values (k,) of a problem.
 
-    In the weighted sum, condition numbers are taken by logarithm.
+    It is γ, the largest relative miss of the goals, for a problem with goals, else the weighted sum. In the weighted
+    sum, condition numbers are taken by logarithm.
+
+    Args:
+        problem: the problem.
+        values: unsmoothed values of the objectives, or of the goals' objectives.
     """
     if problem.goals:
         return max(goal.attainment(value) for goal, value in zip(problem.goals, values))

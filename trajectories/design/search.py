@@ -27,10 +27,10 @@ class Stage(NamedTuple):
     """Settings of one stage of a search.
 
     Attributes:
-        spectra: sharpness p of the smoothed excitation indices.
-        constraints: sharpness ρ of the smoothed constraints.
+        spectra: exponent p of the smoothed excitation indices; the larger, the less they are smoothed.
+        constraints: sharpness ρ of the smoothed constraints; the larger, the less they are smoothed.
         tolerance: SLSQP's tolerance.
-        share: share of the search's evaluations that the stage may use.
+        share: share (0 to 1) of the search's evaluations that the stage may use.
         rough: True uses half of the samples.
         coarse: True uses the problem's coarse family.
     """
@@ -69,7 +69,7 @@ class SearchResult:
     Attributes:
         x: (p,) free variables of the motion family (coefficients that the equations of rest leave free).
         factor: factor on the family's period.
-        merit: the weighted sum of the objectives, or γ for problems with goals.
+        merit: the weighted sum of the objectives; for problems with goals γ, the largest relative miss of the goals.
         values: (k,) unsmoothed values of the objectives, or of the goals' objectives, at the problem's samples.
         history: merits of the feasible iterates that improved on all before, falling.
         evaluations: number of evaluations of constraints and merit.

@@ -46,7 +46,7 @@ class Margin:
 
 @dataclass(frozen=True)
 class Verification:
-    """Margins to all constraints, column by column.
+    """Margins to all constraints, one for each column of a constraint (such as one side of one joint's limit).
 
     Attributes:
         margins: one margin per column of every constraint.

@@ -18,7 +18,7 @@ SAME = 1e-9  # waypoints nearer than this [rad or m] are one
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """A path of n joints as a spline.
+    """A path q = Φ(s) of n joints as a spline, with the path parameter s.
 
     Attributes:
         derivative: (s (N,), order) to (N, n), d^order Φ / ds^order [rad or m per s^order], order 0 to 2.

@@ -16,7 +16,7 @@ TorqueLaw = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """A speed profile along a path: ṡ² at grid points, linear in s between them.
+    """A speed profile along a path with the parameter s: ṡ² at grid points, linear in s between them.
 
     Attributes:
         s: (K + 1,) grid of path parameters, rising from 0.
@@ -115,10 +115,10 @@ def moved(path: Path, s: np.ndarray, speed: np.ndarray, u: np.ndarray) -> tuple[
     """Return joint values, velocities and accelerations q = Φ, v = Φ' ṡ, a = Φ' s̈ + Φ'' ṡ², each (N, n).
 
     Args:
-        path: the path Φ.
-        s: (N,) path parameters.
-        speed: (N,) ṡ.
-        u: (N,) s̈.
+        path: the path Φ(s), with Φ' = dΦ/ds.
+        s: (N,) path parameters s.
+        speed: (N,) ṡ [unit of s per second].
+        u: (N,) s̈ [unit of s per second²].
     """
     slope = path(s, 1)
     velocity = slope * speed[:, None]

@@ -28,7 +28,8 @@ class Shaped:
     Attributes:
         path: the fastest path.
         phi: (p,) path parameters φ of `path`, each from -1 to 1.
-        before, after: durations [s] at φ = 0 and of `path`.
+        before, after: durations [s] of the path at φ = 0 (the spline through the waypoints without via points), and of
+            `path`.
         evaluations: number of paths timed.
         refused: number of the timed paths that have no timing within the limits.
     """

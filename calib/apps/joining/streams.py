@@ -69,7 +69,7 @@ class Streamed(Joined):
         clock: the instrument's clock.
         sigma: robust standard deviation of the position residuals, per axis [m].
         correlation: correlation time τ of the residuals before thinning [s].
-        factor: √τ with τ in steps: the factor by which sigmas would be too small if all rows were fitted.
+        factor: √(τ / time between rows), the factor by which sigmas would be too small if all rows were fitted.
         left: correlation of neighbouring residuals after thinning.
     """
 

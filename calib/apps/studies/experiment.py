@@ -108,7 +108,7 @@ class Experiment:
         problem: input of a method.
         model: identification model of the problem.
         truth: (b,) true values of the model's base parameters.
-        matrix: (K, n, b) base regressor of the assumed robot along the validation motion.
+        matrix: (K, n, b) base regressor of the assumed robot at K samples of the validation motion.
         torque: (K, n) noise-free torques of the true robot along the validation motion, without its unknown payload [N
             m].
     """

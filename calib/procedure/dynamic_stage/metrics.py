@@ -227,8 +227,9 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
 def _error_density(identification: Identification, cases: Sequence[Case]) -> np.ndarray:
     """Return the spectral density of the torque errors (rows,) [N² m² s or N² s].
 
-    The density is the variance of the errors divided by the number of independent rows per second; the information
-    matrix of a motion with regressor ω is ∫ ωᵀω / density dt.
+    The density is the variance of the errors divided by the number of independent rows per second. With it, the
+    information matrix of a motion is ∫ ωᵀω / density dt, where ω is the regressor, the matrix that maps parameters to
+    torques.
 
     Args:
         identification: the identification.

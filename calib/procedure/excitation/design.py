@@ -150,18 +150,20 @@ def excite(
     Without goals, the logarithms of both condition numbers, raw and normalised, are minimised with equal weights; an
     aim such as ``logdet`` replaces them. With goals (``wrist=0.1``), the condition numbers become goals, too. Unless
     the settings state their goal values, these are the values reached in a first search for the condition numbers alone
-    (as the study advises).
+    (as Kolyubin et al. 2019 advise).
 
     Ctrl-C ends the search; the best motion found until then is verified and returned.
 
     Args:
         robot, base, tip: see `calib.robot.library`.
-        settings: see `calib.procedure.excitation.settings`.
-        model: folder of an identification: torques, friction and their uncertainty.
-        limits: see `calib.procedure.excitation.limits`.
-        options: options of the identification that will follow: torque rows, drive terms, payloads.
-        after: folder of an identification whose recordings the motion shall complement; replaces `model`.
-        picked: front of an earlier design with the same settings, whose designed motion is taken instead of a search.
+        settings: goals, period, family of motions, search and playback.
+        model: folder of an identification, from which torques, friction and their uncertainty are taken; None: no
+            identification.
+        limits: limits file (`calib formats limits`), or its content as tables; None: limits of the robot's description.
+        options: options of the identification that will follow (torque rows, drive terms, payloads); None: defaults.
+        after: folder of an identification whose recordings the motion shall complement; replaces `model`; None: none.
+        picked: front of an earlier design with the same settings, whose designed motion is taken instead of a search;
+            None: search.
         map: function that runs the starts of the search, possibly in parallel (`calib.workers`).
         progress: called with a text on each step; None: silent.
 

@@ -29,7 +29,10 @@ MIN_RATE = 50
 
 
 class PrincipalErrors(Protocol):
-    """Principal errors of a calibrated geometry with the covariance Σ λ_i u_i u_iᵀ: g_i = √λ_i u_i, i = 1 … r."""
+    """Principal errors g_i (i = 1 … r) of a calibrated geometry: g_i = √λ_i u_i.
+
+    λ_i and u_i are the largest eigenvalues of the covariance of the geometric parameters, and their eigenvectors.
+    """
 
     @property
     def before(self) -> np.ndarray:
@@ -55,7 +58,8 @@ class PriorMotions:
     Attributes:
         names: names of the files or folders of the motions.
         seconds: duration of the motions [s].
-        information: (b, b) ∫ ωᵀω dt of the design's columns ω, with the rows divided by `sigmas`.
+        information: (b, b) ∫ ωᵀω dt of the regressor ω (rows, b), restricted to the columns of the design, with the
+            rows divided by `sigmas`.
         sigmas: (rows,) square root of the torque errors' spectral density that an identification states; None: 1.
     """
 

@@ -40,7 +40,7 @@ class ParameterChange(NamedTuple):
         sigma: σ of the difference, from both covariances; 0 where neither estimate fitted the parameter.
         alone, alone_sigma: estimated change of the parameter if no other parameter changed, and its σ; NaN where the
             data do not identify it.
-        explained: decrease of χ² by that change.
+        explained: decrease, by that change, of the χ² statistic of the hypothesis that nothing changed.
     """
 
     name: str
@@ -60,7 +60,7 @@ class ChangeTest:
     Attributes:
         chi2, freedom: χ² of the hypothesis that nothing changed, and its degrees of freedom.
         parameters: changes of the parameters, in descending order of the decrease of χ².
-        extra: number of combinations that only the earlier estimate has, and that only the later one has.
+        extra: number of parameter combinations that only the earlier estimate has, and that only the later one has.
     """
 
     chi2: float
@@ -72,8 +72,9 @@ class ChangeTest:
     def probability(self) -> float:
         """p value of the hypothesis that nothing changed.
 
-        It is twice the smaller of two p values (Bonferroni): of χ², and of the largest decrease of χ² by one parameter.
-        1 where no estimated combination could have changed.
+        It is twice the smaller of two p values (Bonferroni). The first is that of the χ² statistic of the difference
+        between both estimates, the second that of the largest decrease of χ² by a change of one parameter. 1 where no
+        estimated combination of parameters could have changed.
         """
         if self.freedom == 0:
             return 1.0
@@ -95,7 +96,7 @@ class ChangeTest:
 
     @property
     def unexplained(self) -> float:
-        """Remaining χ² if only the first of `parameters` changed."""
+        """The χ² statistic of the remaining difference if only the first of `parameters` changed."""
         if not self.parameters:
             return self.chi2
         return max(self.chi2 - self.parameters[0].explained, 0.0)
@@ -112,11 +113,11 @@ class ChangeTest:
         return tuple(parameter.name for parameter in self.parameters[1:] if parameter.explained > best - AS_WELL)
 
     def suffices(self, explained: float, count: int) -> bool:
-        """Return whether the χ² that remains after a decrease may be chance.
+        """Return whether the remaining difference between both estimates may be chance.
 
         Args:
-            explained: decrease of χ².
-            count: number of parameters whose change was fitted for the decrease.
+            explained: decrease of the χ² statistic by changes of some parameters.
+            count: number of these parameters.
         """
         residual = max(self.chi2 - explained, 0.0)
         freedom = max(self.freedom - count, 1)
@@ -142,7 +143,7 @@ class Tested:
         return float(self.difference @ self.difference)
 
     def alone(self, k: int, identifiable: bool = True) -> tuple[float, float, float]:
-        """Return change, σ and decrease of χ² of a parameter if only this parameter changed.
+        """Return change, σ and decrease of the χ² statistic of a parameter if only this parameter changed.
 
         Args:
             k: index (from 0) of the parameter among the p parameters.
@@ -155,7 +156,7 @@ class Tested:
         return along / size**2, 1.0 / size, (along / size) ** 2
 
     def together(self, chosen: np.ndarray) -> tuple[np.ndarray, float, int]:
-        """Return the changes of several parameters that lower χ² most together.
+        """Return the changes of several parameters that lower the χ² statistic most together.
 
         Args:
             chosen: indices of the parameters that may have changed; the change of all others is 0.

@@ -56,8 +56,8 @@ class PartChange:
 
     Attributes:
         name: name of the part.
-        explained: decrease of χ² if only this part changed.
-        count: number of combinations that the part changes.
+        explained: decrease of the χ² statistic of the difference between the models, if only this part changed.
+        count: number of parameter combinations that the part changes.
         rms: rms change of the torque along the first motion if only this part changed [N m or N].
     """
 
