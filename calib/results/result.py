@@ -77,7 +77,16 @@ class Result(Protocol):
 
 
 class ExportSettings(NamedTuple):
-    """Source and format of an exported robot; the fields are the arguments of `calib.export`."""
+    """Source and format of an exported robot.
+
+    Attributes:
+        urdf: URDF of the nominal robot, to be changed; None: the fit's robot is used.
+        prior: prior for masses that the torques do not identify: ``entropic`` or ``euclidean``.
+        ros2: name of a ROS 2 package to write; empty: all file formats are written instead.
+        moveit: MoveIt files to copy into the package.
+        control: whether the package's URDF gets a ``<ros2_control>`` for mock hardware if it has none.
+        overwrite: whether existing files are replaced.
+    """
 
     urdf: Path | None = None
     prior: str = "entropic"

@@ -269,7 +269,8 @@ def critical_times(
     Args:
         problem: the problem.
         y: free variables x (p,) of the family, then the factor on the period where the period is free.
-        min_excess: violation from which a constraint is considered, as a share of its scale.
+        min_excess: violation from which a constraint is considered, as a share of its scale. Of such a constraint,
+            instants up to a tenth of the scale below the limit are returned, too.
         constraints: constraints to check; empty checks those of the problem.
         count: number of instants to check.
     """

@@ -69,7 +69,8 @@ class Sampled:
     Attributes:
         s: (N,) path parameters of the samples.
         weights: (N,) duration that each sample represents [s]; they sum to the duration of the motion.
-        q, v, a, tau: (N, n) joint values, velocities, accelerations, torques; tau is None where no torque law is given.
+        q, v, a, tau: (N, n) joint values [rad or m], velocities, accelerations, torques [N m or N]; tau is None where
+            no torque law is given.
     """
 
     s: np.ndarray

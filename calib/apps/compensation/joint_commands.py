@@ -87,7 +87,8 @@ class Fitted:
         cell: the calibrated arm with stations and tools, deflections included.
         nominal: the nominal arm with the stations and tools that fit the measurements best; no stations if these are
             unknown.
-        free, covariance: indices of the fitted parameters and their covariance, as `read_covariance` returns them.
+        free, covariance: indices of the fitted parameters in the cell's parameter vector, and the covariance of small
+            steps along them.
         unseen: rms error of the calibrated arm at held-out poses [m]; None without such poses.
         fitted: rms error at the fitted poses [m]; None where the fit does not contain it.
         fitted_q: (k, n) joint values of the fitted poses [rad or m]; None where the fit does not contain them.
@@ -130,7 +131,7 @@ class Commands:
             model.
         beyond: (m, n) True for joint values outside the range of the fitted poses; all False if the range is unknown.
         dof: number of constrained pose components: 6, 5 or 3.
-        notes: remarks on the frames and on anything unusual.
+        notes: remarks on the frames, and warnings.
         own: (m, 2) part of ``before`` due to the arm alone, with the nominal base placed where it fits the measurements
             best; None where ``before`` is already computed so, or where this placement is unknown.
     """
@@ -264,7 +265,8 @@ def computed(
         fitted: the calibrated arm and its cell.
         targets: joint values or poses.
         frame, tool: frame of the targets, and tool at them, as for `placements`.
-        dof: number of constrained pose components, as for `calib.geometry.inverse.Goal`; None for all that the targets
+        dof: number of constrained pose components: 6; 5, free to turn about the tool's z axis; 3, position only; None
+            for all that the targets
             contain and the arm can reach.
         start: (n,) joint values near which targets without joint values are sought [rad or m]; None for the middle of
             the limits.

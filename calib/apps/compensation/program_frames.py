@@ -35,7 +35,8 @@ class Statements:
             from the program.
         world: (4, 4) pose of the controller's base in the arm's base; None: known from the robot's description, or from
             the controller's rule.
-        flange: (4, 4) pose of the controller's flange in the arm's tip; None: as for `world`.
+        flange: (4, 4) pose of the controller's flange in the arm's tip; None: known from the robot's description, or
+            from the controller's rule.
         files: file name to text, of further files of the controller.
     """
 

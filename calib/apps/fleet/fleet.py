@@ -82,7 +82,9 @@ def run_sessions(
     plots: bool = True,
     command: str = "calib.run_sessions",
 ) -> Iterator[FleetRow]:
-    """Run sessions as far as possible, and yield the outcome of each; a failed session does not stop the others.
+    """Run each session until it is complete or waits for files, and yield the outcome of each.
+
+    A failed session does not stop the others.
 
     Args:
         folders: one or several folders of sessions, or their ``session.toml``. Or addresses of fsspec, with or without
@@ -133,9 +135,9 @@ def run(
 
 
 def run_session(folder: Path | str, command: str = "calib run", plots: bool = True, lease: float = LEASE) -> FleetRow:
-    """Run one session as far as possible, write its output to ``run.log`` and return the outcome.
+    """Run one session until it is complete or waits for files, and return the outcome.
 
-    Errors become part of the outcome; only KeyboardInterrupt (Ctrl-C) is raised.
+    Its output is written to ``run.log``. Errors become part of the outcome; only KeyboardInterrupt (Ctrl-C) is raised.
 
     Args:
         folder: the session's folder, or its address.

@@ -83,7 +83,9 @@ def join(
         points: CSV file of measured points.
         by: ``name``, ``time``, ``row``, ``geometry`` or ``motion``; empty: the first of these for which both files have
             columns, except ``motion``.
-        robot, base, tip: the nominal robot, as for `calib.load`, by whose geometry the order is checked or found.
+        robot: the nominal robot, by whose geometry the order is checked or found: library name, file, folder of a fit,
+            or in memory; None: not checked.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
 
     Returns:
         The table, the index of each row's pose, and notes; ``write(path)`` writes the CSV that `fit_geometry` reads. By

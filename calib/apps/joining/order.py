@@ -51,7 +51,8 @@ class Order:
     Attributes:
         pose: (m,) index of each point's pose, -1 for none; several readings of one pose have the same index.
         error: (m,) distance of each point from the point that the nominal arm predicts for that pose [m].
-        rivals: indices of points that another pose explains about as well.
+        rivals: indices of points that another pose explains nearly as well, with an error below `AMBIGUOUS` times the
+            rms.
         origin: how the order was found, in words.
     """
 
@@ -107,7 +108,7 @@ def find_order(chain: Chain, q: np.ndarray, points: np.ndarray, candidates: dict
 def _orders_from(
     chain: Chain, q: np.ndarray, points: np.ndarray, starts: Iterable[np.ndarray], limit: float
 ) -> list[Order]:
-    """Return the orders refined from each start, up to the first that assigns nearly all points to poses.
+    """Return the orders refined from each start, up to the first order that assigns nearly all points to poses.
 
     Args:
         chain: the nominal arm.

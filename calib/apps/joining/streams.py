@@ -91,7 +91,7 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
         chain: the nominal arm.
 
     Raises:
-        MeasurementError: the files are no streams, the arm hardly moves, or the files are not of the same motion.
+        MeasurementError: the files are no streams, the arm moves too little, or the files are not of the same motion.
     """
     log = read_stream(log_file, _joints(chain))
     stream = _fresh(read_stream(file, _target()))
@@ -187,7 +187,13 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
 
 
 def _check_motion(recording: Stream, count: int, unit: str) -> None:
-    """Raise MeasurementError for a recording whose first `count` columns hardly change; `unit` is printed with them."""
+    """Raise MeasurementError for a recording in which no quantity changes by more than `MIN_MOTION`.
+
+    Args:
+        recording: the recording.
+        count: number of columns to check, from the first one on.
+        unit: unit of the columns, for the message.
+    """
     travel = float(np.ptp(recording.values[:, :count], axis=0).max())
     if not travel > MIN_MOTION:
         message = f"moves by only {travel:.2g}{unit}, too little to identify the clocks' offset: is the unit right?"

@@ -176,10 +176,13 @@ def tool(
     """Calibrate the tool (TCP): the target's placement in the arm's tip, from a dozen measured poses.
 
     Args:
-        robot, base, tip: the arm, as for `calib.load`; its geometry is not changed.
-        measured: CSV files, folders of images, or the result of `read_poses`, as for `fit_geometry`.
+        robot: the arm, whose geometry is not changed: library name, file (URDF, or MDH table in TOML), folder of a fit,
+            or a robot in memory.
+        measured: one or several CSV files of measured poses, folders of images, or results of `read_poses`.
         settings: tolerance, and share of the poses to hold out.
-        options, progress: as for `fit_geometry`.
+        options: options for reading the files (`calib formats options`): TOML file, or in memory; None: defaults.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
+        progress: called with a text on each step; None: no report.
 
     Returns:
         The fit: ``placed`` has the frames with σ, ``verdict`` the verdict.

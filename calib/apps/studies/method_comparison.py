@@ -120,7 +120,8 @@ def compare_methods(
     Args:
         inputs: training recordings, and held-out ones.
         methods: names of methods; None: all.
-        friction: as in `IdentificationSettings`; methods that simulate support only ``standard``.
+        friction: friction model: ``standard``, ``auto``, or a step of the ladder; methods that simulate support only
+            ``standard``.
         say: called with each message on progress.
         done: called with each method's result as soon as it is available, not yet ranked.
 
@@ -221,7 +222,7 @@ def _settings(inputs: IdentificationInputs, method: Method, friction: str) -> Id
     Args:
         inputs: the recordings with the user's settings.
         method: the method.
-        friction: friction model, as in `IdentificationSettings`.
+        friction: friction model: ``standard``, ``auto``, or a step of the ladder.
     """
     settings = replace(inputs.options.settings, method=method.name, essential="none", friction=friction)
     if not method.takes_constraints:

@@ -401,7 +401,7 @@ def run_study(
         studies: study files, names of shipped ones, or patterns of these names.
         out: the study's folder; trials whose rows it already contains are not run again.
         methods, runs: replace the methods and the number of runs in the files; None: as in the files.
-        where: where the tasks run, see `calib.workers.workers`.
+        where: number of local processes, or the address of a Dask scheduler; None: the tasks run in this process.
         report_only: run nothing and leave the rows unchanged; possible while another command adds rows.
         plots: whether the report has figures.
         say: called with messages on progress.

@@ -46,7 +46,7 @@ class RowStore:
 
     Attributes:
         folder: folder of the study.
-        rows: key to row.
+        rows: key (digest of the condition, method, seed) to row.
     """
 
     def __init__(self, folder: Path, database: sqlite3.Connection) -> None:
@@ -57,7 +57,11 @@ class RowStore:
         self.rows = {row.key: row for row in _read(database, folder / ROWS)}
 
     def holds(self, key: tuple[str, str, int]) -> bool:
-        """Return whether the store contains the trial with this key, by the method's current version."""
+        """Return whether the store contains a trial that was made with the method's current version.
+
+        Args:
+            key: digest of the condition, method, and seed of the trial.
+        """
         return key in self.rows and self.rows[key].current
 
     def append(self, rows: Sequence[TrialRow]) -> None:

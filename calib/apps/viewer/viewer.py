@@ -77,9 +77,12 @@ def write(folder: str | Path, path: str | Path, robot: str | None = None) -> Sce
 
 
 def write_beside(folder: str | Path) -> str:
-    """Write ``session.rrd`` into a folder if possible, and return its name, or in one line why it failed; never raises.
+    """Write ``session.rrd`` into a folder, and return its name, or in one line why it failed; never raises.
 
     A recording is a convenience: neither a missing package nor a full disk stops the step that writes it.
+
+    Args:
+        folder: folder of a session.
     """
     try:
         write(folder, Path(folder) / FILE)

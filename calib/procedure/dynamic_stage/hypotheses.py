@@ -68,7 +68,7 @@ def gravity_findings(hypotheses: GravityHypotheses | None, joints: Sequence[str]
 def load_findings(inputs: IdentificationInputs, gravity: Sequence[float] | None) -> list[Finding]:
     """Return a finding for each recording whose torques indicate a load that the options do not state.
 
-    Training and held-out recordings with the same stated payload are compared with each other.
+    All recordings, training and held-out ones, with one stated payload are compared with each other.
 
     Args:
         inputs: the recordings.

@@ -69,7 +69,7 @@ class RecordingErrors:
         predictions: name of a recording -> predicted torques (N, rows) at the full sampling rate.
         repeated: name of a held-out recording that repeats training motion -> share of its states (position, velocity)
             that are also in the training motion.
-        excitation: name of a training recording -> report on what its motion can identify.
+        excitation: name of a training recording -> report on the parameters that its motion can identify.
         intervals: name of a held-out recording -> expected torque errors; without held-out recordings, those of the
             first training recording.
     """
@@ -92,7 +92,7 @@ class DynamicsAssessment(RecordingErrors):
     """Errors of a model on the recordings, and the verdict.
 
     Attributes:
-        verdict: see `calib.procedure.dynamic_stage.verdict`.
+        verdict: the verdict, by the rules of `calib.procedure.dynamic_stage.verdict`.
         warnings: texts for the user on the recordings and the model.
         noticed: the findings whose sentences are in the warnings.
         tracking: name of a recording -> simulated tracking with the model as feedforward.

@@ -138,12 +138,12 @@ def gather(
     """Return the inputs of an identification from files: the robot, and all recordings as filtered motions.
 
     Args:
-        robot: a name or file as in `calib.robot.library`, or a robot returned by a geometric fit.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
         recordings, validate: training and held-out recordings: paths, each with an optional cut (``log.npz@0:9.4``), or
             recordings in memory.
         options: content of the options file; None: defaults.
         method, friction: identification method and friction model; None: as in the options.
-        base, tip: links of a URDF at which the chain begins and ends; None: see `calib.robot.library`.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
         seed: seed of all random numbers.
         designed: designed motions, which are searched in recordings without a reference if the options have a [loop].
         progress: called with a text on each step; None: silent.

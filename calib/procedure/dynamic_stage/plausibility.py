@@ -69,7 +69,7 @@ def implausible(
 
 
 def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Finding]:
-    """Return findings on implausible sizes of torques and velocities, and on wrong clocks, of recordings.
+    """Return findings on torques and velocities of implausible size in recordings, and on wrong clocks.
 
     Args:
         sizes: for each recording, the sizes of its quantities compared with the robot's description.

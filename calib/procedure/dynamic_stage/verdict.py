@@ -74,7 +74,8 @@ def judge(
 ) -> tuple[str, list[Finding]]:
     """Return a sentence on the torque errors on held-out motion, and the findings that worsen the verdict.
 
-    Recordings in which the robot hardly moves are ignored. The first finding is the worst of ``motion-poor``,
+    Recordings that the scores mark as no evidence, since the robot stands or nearly stands, are ignored. The first
+    finding is the worst of ``motion-poor``,
     ``torque-unexplained``, ``training-torque-unexplained`` and ``no-torque-transfer`` (on the error of all joints
     together; the first one if several are equally bad). Without usable held-out motion, the first findings state the
     training error and why there is no held-out motion. ``joints-unexplained`` follows, since a total hides joints with
@@ -235,7 +236,7 @@ def with_prior(verdict: Verdict, rests: Resting) -> Verdict:
 
 
 def motion_findings(validation: Mapping[str, Score], repeated: Mapping[str, float]) -> list[Finding]:
-    """Return findings on held-out recordings that repeat the training motion, or in which the robot stands.
+    """Return findings on held-out recordings that repeat the training motion, or in which the robot does not move.
 
     Args:
         validation: name of a held-out recording -> score of the model.
@@ -249,7 +250,9 @@ def motion_findings(validation: Mapping[str, Score], repeated: Mapping[str, floa
 
 
 def excitation_notes(excitation: Mapping[str, ExcitationReport]) -> list[str]:
-    """Return remarks on what the training motions cannot identify, each beginning with the name of the recording.
+    """Return remarks on parameters that the training motions cannot identify.
+
+    Each begins with the name of the recording.
 
     Args:
         excitation: name of a training recording -> report on its motion.

@@ -90,8 +90,9 @@ class Designed:
         stored_front: the front with its motions, as the folder keeps it; None without a front.
         playback: setpoints for the controller.
         notes: remarks for the user.
-        doubts: those of the remarks that are on goals: missed, or decided by typical friction.
-        outlook: prediction of what the motion identifies; None without torque limits, from which torque errors are
+        doubts: those `notes` that are on goals which are missed, or whose value depends on assumed typical friction.
+        outlook: predicted accuracy of the parameters and torques that the motion identifies; None without torque
+            limits, from which torque errors are
             assumed.
         predicted: predicted σ of the parameters; empty without `outlook`.
     """
@@ -155,11 +156,12 @@ def excite(
     Ctrl-C ends the search; the best motion found until then is verified and returned.
 
     Args:
-        robot, base, tip: see `calib.robot.library`.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
         settings: goals, period, family of motions, search and playback.
         model: folder of an identification, from which torques, friction and their uncertainty are taken; None: no
             identification.
         limits: limits file (`calib formats limits`), or its content as tables; None: limits of the robot's description.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
         options: options of the identification that will follow (torque rows, drive terms, payloads); None: defaults.
         after: folder of an identification whose recordings the motion shall complement; replaces `model`; None: none.
         picked: front of an earlier design with the same settings, whose designed motion is taken instead of a search;

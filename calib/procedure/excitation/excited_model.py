@@ -70,11 +70,13 @@ def read_model(
     Args:
         chain: the arm.
         folder: folder of an identification, whose torque rows are used; None: no identification.
-        sets: drive terms of motor torques, used without folder and options; empty: default terms.
+        sets: names of drive terms of motor torques (``Ia Fv Fc off``), used without folder and options; empty: default
+            terms.
         limits: limits of the motion, with the friction that the limits file states.
         options: options of the later identification, allowed only without a folder; None: defaults.
-        loads: payloads of each run, see `ExcitationSettings`.
-        nominal: arm on which base columns are selected, see `excited_model`; None: `chain`.
+        loads: payloads of each run: ``none``, or labels joined by ``+``; empty: one run without, and one with each
+            payload.
+        nominal: arm on whose geometry the base parameters are selected, as in the identification; None: `chain`.
 
     Raises:
         UsageError: for an unknown payload, or if both folder and options are given.
@@ -241,8 +243,8 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str], nominal: Chain
     Args:
         chain: the arm.
         folder: folder of the identification.
-        texts: payloads of each run, see `loads_of`.
-        nominal: arm on which base columns are selected; None: `chain`.
+        texts: payloads of each run: ``none``, or labels joined by ``+``.
+        nominal: arm on whose geometry the base parameters are selected; None: `chain`.
 
     Raises:
         UsageError: if the identification belongs to another arm, or its torque rows are not suited for a design.

@@ -40,7 +40,8 @@ def objectives_of(
 
     Args:
         settings: settings of the design.
-        condition: condition number as an objective, from which the others are derived, see `read_goals`.
+        condition: condition number as an objective, with the columns, rows and earlier information of the design; the
+            other objectives are derived from it.
         inputs: robot and model; without goals, the aim is ``logdet`` if an identification states torque errors.
 
     Raises:

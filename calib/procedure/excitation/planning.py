@@ -227,14 +227,15 @@ def plan(
     """Return the fastest motion of a robot through waypoints, within its limits.
 
     Args:
-        robot, base, tip: see `calib.robot.library`.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
         waypoints: CSV file of joint values or tool poses; or in memory joint values (m, n) [rad or m], poses (m, 4, 4)
             [m], or targets.
-        settings: see `calib.procedure.excitation.settings`.
+        settings: payloads, straight lines, rate, start, and optimisation of the path's shape.
         model: folder of an identification, whose geometry and torques are used; the limits are those of the robot;
             None: masses of the robot's description.
-        limits: see `calib.procedure.excitation.limits`; None: limits of the robot's description.
-        drives: drive parameters, see `_read_drives`; None: unknown.
+        limits: limits file (`calib formats limits`), or its content as tables; None: limits of the robot's description.
+        drives: TOML file with a table ``[drives]`` of Ia, Fv, Fc, off per joint, or its tables; None: unknown.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
         progress: called with a text on each step; None: silent.
 
     Raises:

@@ -185,7 +185,8 @@ def _parameter_rows(
 
     Args:
         inputs: the robot and its model.
-        root, shifts: the two parts of the parameters' errors, see `_prediction`.
+        root: (c, c) square root of the parameters' covariance from torque errors.
+        shifts: (c, r) shifts of the parameters by the principal errors of the geometry.
         sigmas_before: (c,) σ of the identification that the motion complements; None: no such identification.
     """
     model, columns = inputs.model, inputs.columns.kept
@@ -216,7 +217,7 @@ def known_sigmas(inputs: ExcitationInputs, task: Task) -> tuple[tuple[np.ndarray
         task: the typical task.
 
     Returns:
-        σ of torques (see `_torque_sigma`), and σ (c,) of parameters.
+        σ of each joint's torque (n,) with the rms of σ / torque limit, and σ (c,) of the parameters.
     """
     root = _root(_information_root(inputs))
     shifts = _shifts_before(inputs)

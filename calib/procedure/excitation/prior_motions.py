@@ -31,7 +31,8 @@ MIN_RATE = 50
 class PrincipalErrors(Protocol):
     """Principal errors g_i (i = 1 … r) of a calibrated geometry: g_i = √λ_i u_i.
 
-    λ_i and u_i are the largest eigenvalues of the covariance of the geometric parameters, and their eigenvectors.
+    λ_i and u_i are the eigenvalues of the covariance of the geometric parameters that are not negligible, and their
+    eigenvectors.
     """
 
     @property

@@ -78,11 +78,14 @@ def edited_urdf(robot: CalibratedChain, source: Path, for_corrections: bool = Fa
 
 
 def chain_in(tree: UrdfTree, chain: Chain, base: str | None = None) -> Chain:
-    """Return the chain in a URDF that has the joints and tip of another chain, as far as the URDF contains these names.
+    """Return the arm in a URDF that corresponds to another arm.
+
+    It has the joints and the tip of the other arm if the URDF contains these names; otherwise they are chosen by
+    default.
 
     Args:
         tree: the URDF.
-        chain: the other chain.
+        chain: the other arm.
         base: name of the first link; None: determined by the joints.
     """
     joints = chain.joint_names if chain.joint_names[0] in tree.joints else None
@@ -91,7 +94,7 @@ def chain_in(tree: UrdfTree, chain: Chain, base: str | None = None) -> Chain:
 
 
 def check_readback(edited: str, where: str, chain: Chain) -> str:
-    """Check that Pinocchio and yourdfpy compute the same poses from a URDF text as this toolkit (`MAX_DIFFERENCE`).
+    """Check that Pinocchio and yourdfpy compute the same poses from a URDF text as this toolkit.
 
     Args:
         edited: text of the URDF.

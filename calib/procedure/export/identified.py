@@ -93,7 +93,8 @@ def read(folder: Path, prior: str = "entropic") -> IdentifiedRobot:
 
     Args:
         folder: folder of the identification.
-        prior: prior for parameters that the torques do not identify, see `find_possible`.
+        prior: prior for parameters that the torques do not identify: ``entropic``, or ``euclidean``, its second-order
+            expansion.
     """
     refuse_currents(folder, "an export of masses")
     information = read_information(folder)

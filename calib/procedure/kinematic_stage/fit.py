@@ -145,7 +145,7 @@ def run(
     """Fit the geometry, and return the chosen model, errors on all rows, and the verdict.
 
     Args:
-        inputs: see `calib.procedure.kinematic_stage.inputs.gather`.
+        inputs: robot, rows to fit, and validation rows.
         options: content of the fit options file; None: defaults.
         settings: model, loss and folds of the ladder, tolerance, seed; None: defaults.
         progress: called with a text on each stage; None: silent.
@@ -222,7 +222,7 @@ def run(
 def _rigid_misfit(
     selection: ModelSelection, changes: Sequence[Finding], climb: Callable[..., ModelSelection], weighing: Settings
 ) -> Finding | None:
-    """Return a finding if no rigid geometry explains the rows, or if a few grossly wrong rows are the reason.
+    """Return a finding if no rigid geometry explains the rows, or if a few rows with gross errors are the reason.
 
     Otherwise, None is returned.
 
@@ -340,7 +340,8 @@ def _findings(
 def _moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], settings: Settings) -> list[Finding]:
     """Return a finding if the instrument seems to have moved between the files; otherwise an empty list.
 
-    The finding is made if the nominal arm's errors are much smaller when each file gets a station of its own.
+    The finding is made if the nominal arm's errors are much smaller when each file has a separate station (position of
+    the instrument).
 
     Args:
         nominal: the nominal arm with base and tool placed.

@@ -20,7 +20,10 @@ MAX_NOISE = 4.0
 
 
 def image_coverage(fit: GeometricFit) -> tuple[ImageCoverage, ...]:
-    """Return how densely the corners in a fit cover the image area, for each set of images; empty without images."""
+    """Return the number of corners in each cell of the image area, and their errors, for each set of images.
+
+    Empty without images.
+    """
     result = []
     for piece in fit.pieces:
         block, part = fit.blocks[piece.block].measured, piece.part

@@ -43,7 +43,7 @@ class Unseen:
         block: the measurements; station and tool have the names of the fit's station and tool unless `own_frames`.
         own_frames: whether base and tool placement are to be fitted to these rows.
         held_out: True for a held-out share of a fit file, False for a validation file.
-        seen: whether the same rows were fitted, so that their errors are no evidence.
+        seen: whether these rows were fitted, too, so that their errors are no evidence.
     """
 
     block: PoseMeasurements
@@ -120,12 +120,12 @@ def gather(
     """Return the inputs of a fit from files: the robot, the named stations and tools, fitted and held-out rows.
 
     Args:
-        robot: a name or file, see `calib.robot.library`; or a robot in memory.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
         measured: files, or blocks in memory, to fit.
         validate: files, or blocks in memory, for the validation.
         options: options for reading the files; None: defaults.
         settings: stations, tools, share of rows to hold out, and seed; None: defaults.
-        base, tip: links of a URDF; None: see `calib.robot.library`.
+        base, tip: first and last link of the arm in a URDF; None: chosen by the joint columns of the measurements.
 
     Raises:
         UsageError: without a measurement file.
@@ -243,10 +243,10 @@ def load_robot(
     """Return a robot's chain and its file; the chain of a URDF is the one with the joints of the measured table.
 
     Args:
-        robot: a name or file, see `calib.robot.library`; or a robot in memory.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
         measured: file with joint columns; None: the table is not considered.
         options: options for reading the file.
-        base, tip: links of a URDF; None: chosen by default.
+        base, tip: first and last link of the arm in a URDF; None: chosen by default.
     """
     if isinstance(robot, CalibratedChain):
         return robot.complete, Path(robot.source or robot.chain.name)
@@ -277,9 +277,9 @@ def load_rigid(
     corrections. The geometry that was fitted together with corrections is less accurate without them.
 
     Args:
-        robot: a name or file, see `calib.robot.library`; or a robot in memory.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
         measured: table whose joint columns determine the chain of a URDF; None: no table.
-        base, tip: links of a URDF; None: chosen by default.
+        base, tip: first and last link of the arm in a URDF; None: chosen by default.
     """
     if isinstance(robot, CalibratedChain):
         return robot, Path(robot.source or robot.chain.name)
@@ -477,7 +477,7 @@ def _carried_name(device: tuple[str, object], carried: Sequence[tuple[str, objec
 
     Args:
         device: kind and identity of what the arm carried in the file.
-        carried: the same of all files, each once.
+        carried: kind and identity of everything that the arm carried in any file, each once.
     """
     kind = device[0]
     of_kind = [candidate for candidate in carried if candidate[0] == kind]

@@ -128,8 +128,8 @@ class Findings:
         reach: reach of the arm [m].
         loss: loss function that was used; empty if unknown.
         noticed: findings on the fit that do not depend on held-out rows, worst first.
-        blind: stations that were cross-validated only by regions, since their tool is not identifiable from the other
-            stations.
+        blind: stations that cross-validation could not hold out as a whole, since the other stations do not determine
+            their tool; only regions of their poses were held out.
         discrepancy: distribution of the error at a pose, estimated by cross-validation; None if not estimated.
         rigid_cross_validated: cross-validated error of the best model without joint corrections [m]; None if not
             computed.

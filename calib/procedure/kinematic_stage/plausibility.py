@@ -73,7 +73,7 @@ def misfit(selection: ModelSelection, reach: float) -> Finding | None:
 
 
 def gross_rows(selection: ModelSelection, robust: ModelSelection, reach: float) -> Finding | None:
-    """Return a finding if a few grossly wrong rows cause the error that `misfit` reports; otherwise None.
+    """Return a finding if a few rows with gross errors cause the error that `misfit` reports; otherwise None.
 
     Args:
         selection: models fitted with a loss that gives full weight to every row.

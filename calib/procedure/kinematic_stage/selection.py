@@ -74,8 +74,8 @@ class Chosen:
 
     Attributes:
         chain: the nominal arm.
-        selection: see `calib.poses.select`.
-        parameters: number of parameters that are identifiable from the measurements.
+        selection: the selected poses with index and efficiency (`calib.poses.select.Selection`).
+        parameters: number of parameters that are identifiable from measurements at any poses.
         existing: index of the existing poses alone; None without existing poses, or if they are too few.
         checked, unchecked: constraints that were checked, and constraints that could not be checked, as text.
         notes: other remarks for the user.
@@ -138,13 +138,12 @@ def choose(
     """Return the m poses that determine the robot's geometry best.
 
     Args:
-        robot: a name or file, see `calib.robot.library`; or a robot in memory.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
         m: number of poses.
         settings: quantity to measure, index, method, seed.
-        constraints: constraints file, or its content as tables, see `calib.procedure.measuring.constraints_file`; None:
-            defaults.
+        constraints: constraints file (`calib formats constraints`), or its content as tables; None: defaults.
         existing: poses measured earlier, which the selection complements: a CSV, or in memory; None: none.
-        base, tip: links of a URDF; None: see `calib.robot.library`.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
         map: function that runs parallel work (`calib.workers`).
         progress: called with (done, total, text); None: silent.
 

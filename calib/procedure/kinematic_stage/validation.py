@@ -235,7 +235,7 @@ def _gross(proof: _Proof, reach: float) -> Iterator[Finding]:
 
 
 def _far_above_median(sizes: np.ndarray) -> np.ndarray:
-    """Return flags (m,): whether each of m errors `sizes` [m] is far above the median error."""
+    """Return flags (m,): whether each of m errors `sizes` [m] is above `OUTLIER_SIGMAS` times the median error."""
     return sizes > OUTLIER_SIGMAS * np.median(sizes)
 
 
@@ -258,7 +258,7 @@ def _row_texts(comparison: Comparison, selected: np.ndarray) -> list[str]:
 def _nothing_gained(proofs: Sequence[_Proof], findings: Findings) -> list[Finding]:
     """Return a finding if the calibrated arm is as good as the nominal one; otherwise an empty list.
 
-    Then there is nothing to gain, or no better model.
+    The finding states that there is nothing to gain, or that no better model was found.
 
     Args:
         proofs: errors on which the verdict is based.

@@ -574,7 +574,7 @@ def drivable(
     """Return a run through poses q (m, n) in which candidates replace the poses without a collision-free path.
 
     Args:
-        chain, limits, settings, seed, progress: see `calib.procedure.measuring.measuring_run.plan_run`.
+        chain, limits, settings, seed, progress: as for `plan_run`.
         q: the poses [rad or m].
         exchange: candidate poses that may replace unreachable ones.
     """
@@ -608,7 +608,7 @@ def _rejoined(
     """Return poses with unreachable ones replaced, the replacements, and all collision-free paths.
 
     Args:
-        chain, limits, settings, seed: see `calib.procedure.measuring.measuring_run.plan_run`.
+        chain, limits, settings, seed: as for `plan_run`.
         q: (m, n) the poses [rad or m].
         run: run through the poses, which leaves out unreachable ones.
         exchange: candidate poses that may replace unreachable ones.

@@ -125,9 +125,10 @@ def read_limits(
     Args:
         tables: path of the file, or its content as tables; tables for motions (`MOTION`) are ignored; None: only
             defaults apply.
-        cell: the arm with its targets, see `calib.geometry.observability.targets_of`.
+        cell: the arm with its targets, as `calib.geometry.observability.targets_of` returns it.
         source: the robot's file; if it is a URDF, its collision shapes are used; None: no file.
-        without: names of `DEFAULTS` that do not apply, and names of `CELL` objects that do not exist.
+        without: defaults that do not apply (self-collision, floor, joint-margin, view), and objects that the cell does
+            not have (instrument, box, obstacles).
 
     Raises:
         UsageError: for an unknown key or an invalid value.
@@ -214,7 +215,8 @@ def limits_of(
         cell: the arm with its targets.
         source: the robot's file; if it is a URDF, its collision shapes are used; None: no file.
         where: name of the constraints file for messages.
-        without: names of `DEFAULTS` that do not apply, and names of `CELL` objects that do not exist.
+        without: defaults that do not apply (self-collision, floor, joint-margin, view), and objects that the cell does
+            not have (instrument, box, obstacles).
         measured: True for poses at which an instrument measures; False for motions, which need no line of sight.
 
     Raises:
@@ -257,7 +259,7 @@ def _unchecked(settings: ConstraintsFile, absent: set[str], measured: bool) -> t
 
     Args:
         settings: content of the constraints file.
-        absent: names of defaults and objects that do not apply.
+        absent: defaults and objects that do not apply, such as ``floor`` or ``instrument``.
         measured: True for poses at which an instrument measures; False for motions.
     """
     instrument = settings.instrument or InstrumentTable()
@@ -287,7 +289,8 @@ def _joint_margin(spans: Mapping[str, object], where: str) -> float:
 def _joints(
     spans: Mapping[str, object], cell: Installation, where: str, margin: float
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Return lower and upper joint limits (n,) [rad or m], and notes for the user on suspicious ranges in the file.
+    """Return lower and upper joint limits (n,) [rad or m], and notes for the user on ranges in the file without effect
+    or in the wrong unit.
 
     Args:
         spans: table ``[joints]``: joint name -> range.

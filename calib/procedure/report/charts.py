@@ -267,7 +267,7 @@ def histogram(axes: Axes, counts: ArrayLike, edges: ArrayLike, colour: str = AFT
 
     Args:
         axes: axes to draw on.
-        counts: counts.
+        counts: number in each bin.
         edges: bin edges, rising.
         colour: colour of the bars.
     """

@@ -140,7 +140,7 @@ class Report:
         noise: nature (position, orientation) -> rms error that the instrument's stated σ alone causes [m, rad]; None:
             no σ was stated.
         images: density of detected corners over each camera's images; empty: no images.
-        files: files that were read, see `file_row`.
+        files: files that were read: name, role, size in bytes, SHA-256.
         source: path of the robot's description.
     """
 

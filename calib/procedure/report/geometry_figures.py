@@ -87,7 +87,8 @@ def residuals_by_joint(
         before, after: (m,) error sizes of the nominal and of the calibrated arm [m] or [rad].
         joint_names: (n,) names of the joints.
         prismatic: (n,) whether each joint is prismatic.
-        nature, arm: as in `error_histogram`.
+        nature: ``position``, ``orientation`` or ``distance``.
+        arm: printed name of the arm with the errors `after`.
     """
     factor, unit = ERRORS[nature]
     sizes = factor * np.concatenate([before, after])

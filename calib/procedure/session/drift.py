@@ -230,7 +230,7 @@ def trends(
 
 
 def _poses(key: np.ndarray) -> np.ndarray:
-    """Return for each row the index (m,) of the first row with nearly the same pose.
+    """Return for each row the index (m,) of the first row with the same pose, up to a difference of `SAME`.
 
     Args:
         key: (m, k) joint values, and scaled indices of target and station.
@@ -239,7 +239,13 @@ def _poses(key: np.ndarray) -> np.ndarray:
 
 
 def _one_clock(times: Sequence[np.ndarray]) -> bool:
-    """Return whether the time ranges of files do not overlap; they overlap if each file counts from its own start."""
+    """Return whether the time ranges of files do not overlap, so that the files can have one clock.
+
+    They overlap if each file counts from its own start.
+
+    Args:
+        times: times of the rows of each file [s].
+    """
     spans = sorted((each.min(), each.max()) for each in times)
     return all(one[1] <= two[0] for one, two in pairwise(spans))
 

@@ -108,7 +108,10 @@ class ChangeTest:
 
     @property
     def rivals(self) -> tuple[str, ...]:
-        """Names of further parameters whose change alone would explain the difference about as well as the first's."""
+        """Names of further parameters whose change alone would explain the difference nearly as well as the first's.
+
+        Their decrease of the χ² statistic is less than `AS_WELL` below that of the first of `parameters`.
+        """
         best = self.parameters[0].explained
         return tuple(parameter.name for parameter in self.parameters[1:] if parameter.explained > best - AS_WELL)
 

@@ -152,7 +152,7 @@ def records(
         setup: robot, instrument and method; the certificate contains only the entries of `CERTIFIED_SETUP`.
         stages: contents on the stages.
         unchecked: texts on unproven properties in addition to those of the stages.
-        files: input files, see `calib.procedure.report.fit_report.file_row`; the most important ones first.
+        files: input files (name, role, size in bytes, SHA-256), the most important ones first.
         details: entries made by a person.
         alert: warning at the top; empty: no warning.
     """
