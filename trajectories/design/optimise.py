@@ -79,7 +79,18 @@ def design(
 
 
 class _Starts:
-    """Searches from several start motions, and the results so far; the searches run stage by stage."""
+    """Searches from several start motions, and the results so far; the searches run stage by stage.
+
+    Args:
+        problem: the excitation problem.
+        evaluations: largest number of evaluations per start.
+        method: optimiser, as for `design`.
+        seed: seed of the random starts.
+        map: the builtin, or a parallel map that returns results in order.
+        report: called with the number of finished searches, the number of all searches, and a sentence; None: no
+            report.
+        starts: number of all start motions.
+    """
 
     def __init__(
         self,

@@ -204,7 +204,12 @@ def _at_stage(problem: ExcitationProblem, stage: Stage, extra: np.ndarray) -> tu
 
 
 class StartSearch:
-    """Search from one start motion in one problem: the state that the optimiser's callbacks share."""
+    """Search from one start motion in one problem: the state that the optimiser's callbacks share.
+
+    Args:
+        problem: the excitation problem.
+        basis: linear map from variables to motion of the problem.
+    """
 
     def __init__(self, problem: ExcitationProblem, basis: Basis):
         self.problem = problem

@@ -50,6 +50,11 @@ class Guard:
     """Middleware that refuses requests without the token.
 
     It also refuses requests for another host name (DNS rebinding), and POST requests from other sites' pages.
+
+    Args:
+        app: the web application.
+        token: the token; empty: none is required.
+        host: host name that is accepted besides numeric addresses and this computer's names.
     """
 
     def __init__(self, app: ASGIApp, token: str, host: str) -> None:

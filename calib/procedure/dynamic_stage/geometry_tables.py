@@ -43,9 +43,11 @@ TORQUE_COVARIANCE = "covariance_torque.csv"
 
 @dataclass(frozen=True)
 class TiltEffect:
-    """Parameter that changes most if the base is tilted by 1 mrad, and its change in σ from torque noise.
+    """Parameter that changes most if the base is tilted by 1 mrad.
 
-    The change is a multiple of the parameter's standard deviation from torque noise.
+    Attributes:
+        parameter: name of the parameter.
+        sigmas: its change, divided by its standard deviation from torque noise.
     """
 
     parameter: str
@@ -54,7 +56,13 @@ class TiltEffect:
 
 @dataclass(frozen=True)
 class CalibrationChange:
-    """Change of a parameter from the nominal to the calibrated geometry, in multiples of its total σ and in percent."""
+    """Change of a parameter from the nominal to the calibrated geometry.
+
+    Attributes:
+        name: name of the parameter.
+        sigmas: the change, divided by the parameter's total σ.
+        percent: the change in percent of the value on the calibrated geometry.
+    """
 
     name: str
     sigmas: float
@@ -85,7 +93,16 @@ class GeometryMetrics:
 
 
 class TwoGeometries(NamedTuple):
-    """A row of ``geometries.csv``: a parameter identified on the nominal and on the calibrated geometry."""
+    """A row of ``geometries.csv``: a parameter identified on the nominal and on the calibrated geometry.
+
+    Attributes:
+        name, unit: name and unit of the parameter.
+        nominal, sigma_nominal: estimate on the nominal geometry, and its σ from torque noise.
+        calibrated, sigma_calibrated: estimate on the calibrated geometry, and its total σ.
+        relative_percent: nominal minus calibrated estimate, in percent of the calibrated one; NaN if that is zero.
+        sigma_difference: standard deviation of the difference.
+        essential: ``yes`` for essential parameters, otherwise ``no``.
+    """
 
     name: str
     unit: str
@@ -99,7 +116,23 @@ class TwoGeometries(NamedTuple):
 
 
 class GeometricEffect(NamedTuple):
-    """A row of ``geometry_effects.csv``: the effect of one σ of a geometric element on the dynamic parameters."""
+    """A row of ``geometry_effects.csv``: the effect of a geometric element's uncertainty on the dynamic parameters.
+
+    Attributes:
+        rank: rank of the element by `shift_sigma`, from 1.
+        element, unit: name and unit (m or rad) of the element.
+        sigma: σ of the element; NaN if it was not fitted.
+        matters: ``yes`` if the element alone raises the σ of some parameter by more than 1 %, else ``no``; empty
+            without σ.
+        parameter: name of the parameter that the element shifts most; empty if it shifts none.
+        shift_sigma: shift of this parameter if the element changes by one σ, divided by the parameter's σ from torque
+            noise.
+        parameters_moved: number of parameters whose σ the element alone raises by more than 1 %; None without σ.
+        torque_rms: rms change of the rigid-body torque if the element changes by one σ, at constant parameters [N m or
+            N].
+        torque_rms_left: the same after the parameters have been estimated again [N m or N].
+        shift_sigma_per_milli: shift as `shift_sigma`, for a change of the element by 1 mm or 1 mrad.
+    """
 
     rank: int
     element: str

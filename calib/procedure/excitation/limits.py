@@ -449,7 +449,13 @@ def _bounds(
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Named points of links: function of joint values q (N, n) with positions (N, k, 3) [m] in the base frame."""
+    """Named points of links: function of joint values q (N, n) with positions (N, k, 3) [m] in the base frame.
+
+    Attributes:
+        chain: the arm.
+        joints: for each of k points, the number (from 1) of the joint behind which it is fixed; 0: fixed to the tip.
+        places: (k, 3) coordinates of the points in the frames behind these joints [m].
+    """
 
     chain: Chain
     joints: tuple[int, ...]
@@ -485,7 +491,16 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class _PoseLimit:
-    """A constraint of pose selection that is applied to each sampled posture of a motion."""
+    """A constraint of pose selection that is applied to each sampled posture of a motion.
+
+    Attributes:
+        of: the constraint, with k values per posture.
+        name: its name in messages.
+        labels: (k,) names of the values.
+        scale: (k,) numbers [unit] by which values are divided to compare different constraints.
+        groups: (k,) group number of each value; the optimiser gets one smooth function per group.
+        unit: unit of the values.
+    """
 
     of: PoseConstraint
     name: str

@@ -74,8 +74,13 @@ class MotionPrediction:
 class PredictedSigma(NamedTuple):
     """A row of ``prediction.csv``: a parameter, and the σ predicted for the motion as it is to be run.
 
-    `value` is None if unknown, and `rsd` is σ in percent of the value. `sigma_before` is the σ of the identification
-    that the motion complements, `sigma_geometry` the part of σ from the geometry; both are None if there is none.
+    Attributes:
+        name, unit: name and unit of the parameter.
+        value: its value; None if unknown.
+        sigma: predicted standard deviation.
+        rsd: `sigma` in percent of the value; None if the value is unknown.
+        sigma_before: σ by the identification that the motion complements; None: no such identification.
+        sigma_geometry: part of `sigma` that is due to the uncertain geometry; None if the geometry is taken as exact.
     """
 
     name: str

@@ -107,7 +107,12 @@ def read(folder: Path, prior: str = "entropic") -> IdentifiedRobot:
 
 @dataclass(frozen=True)
 class ExportedPrediction:
-    """Unexplained share of a recording's torque [%], predicted by the exported robot and by the identified model."""
+    """Unexplained share of a recording's torque [%], predicted by the exported robot and by the identified model.
+
+    Attributes:
+        file: table of the recording's torques, relative to the folder of the identification.
+        exported, identified: shares of the exported robot and of the identified model [%].
+    """
 
     file: str
     exported: float

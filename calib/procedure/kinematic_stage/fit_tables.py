@@ -52,7 +52,13 @@ NOT_FITTED = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class EstimateTable:
-    """Rows of ``estimate.csv`` (name, unit, nominal value, value), and the covariance (rows, rows) of the values."""
+    """Fitted parameters as in ``estimate.csv``.
+
+    Attributes:
+        names, units: names and units of the parameters.
+        nominal, values: nominal and fitted values.
+        covariance: (rows, rows) covariance of the values.
+    """
 
     names: tuple[str, ...]
     units: tuple[str, ...]

@@ -94,7 +94,14 @@ class ComparedRows:
 
 @dataclass(frozen=True)
 class Outlier:
-    """A row with a large residual, in robust standard deviations of all rows, and in mm or deg."""
+    """A row with a large residual.
+
+    Attributes:
+        file, row: file and row number.
+        nature: kind of the residual: position, orientation or distance.
+        sigmas: size of the residual, in robust standard deviations of all rows.
+        size_mm, size_deg: size in mm or in degrees; the other one is None.
+    """
 
     file: str
     row: int
@@ -178,7 +185,19 @@ class ValidationMetrics:
 
 @dataclass(frozen=True, kw_only=True)
 class FitMetrics(ValidationMetrics):
-    """The content of a fit's ``metrics.json``; see `calib.procedure.kinematic_stage.folder`."""
+    """The content of a fit's ``metrics.json``.
+
+    Attributes:
+        fit: errors of both arms on the fitted rows.
+        model: name of the chosen model.
+        ladder: tried models with their cross-validated errors.
+        seed: seed of all random numbers.
+        tolerance_mm: largest acceptable rms on held-out poses [mm]; None: none was stated.
+        not_identifiable: texts on parameters that the poses do not identify.
+        outliers: fitted rows with large residuals, worst first.
+        findings: findings that the verdict needs besides the errors; None in files of earlier versions.
+        status: how the optimisation ended; empty in files of earlier versions.
+    """
 
     fit: ComparedRows
     model: str

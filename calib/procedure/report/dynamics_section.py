@@ -81,7 +81,16 @@ FED_FORWARD = {
 
 
 class IdentifiedParameter(NamedTuple):
-    """A row of ``estimate.csv``; the relative standard deviation `rsd` is in percent; σ is None if not estimated."""
+    """A row of ``estimate.csv``.
+
+    Attributes:
+        name, unit: name and unit of the parameter.
+        expression: text that explains the parameter: the combination of standard parameters that it stands for, or its
+            drive term.
+        value: the estimate.
+        sigma: standard deviation, from torque noise and geometry; None if it was not estimated.
+        rsd: `sigma` in percent of the value; None if it is unknown.
+    """
 
     name: str
     expression: str

@@ -141,7 +141,11 @@ def shortened(text: str, max_letters: int) -> str:
 class Text:
     """A list of sentences.
 
-    On the console, each sentence is printed after `label`, or after ``warning`` if it is a warning.
+    Attributes:
+        title: title above the sentences; empty: none.
+        lines: the sentences; a `Note` may be a warning.
+        label: word before each sentence on the console; a warning has ``warning`` instead.
+        kind: name of the kind of block, for the templates.
     """
 
     title: str
@@ -229,7 +233,12 @@ def met(value: float, tolerance: float) -> str:
 class Section:
     """A part of a report.
 
-    A section on a judged result has a verdict (pass, marginal, fail), a reason and key figures.
+    Attributes:
+        title: title of the section.
+        blocks: tables, texts and pictures.
+        verdict, reason: level of the verdict (pass, marginal, fail) and its reason; empty for sections that are not on
+            a judged result.
+        figures: numbers on which the verdict is based.
     """
 
     title: str

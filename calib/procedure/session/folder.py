@@ -91,7 +91,14 @@ Say = Callable[[str], None]
 class StepRecord:
     """Record of a completed step in ``state.json``.
 
-    It contains time, version, notes, and fingerprints of inputs and outputs (SHA-256 of files, values of settings).
+    Attributes:
+        finished: date and time at which the step was completed, ISO 8601.
+        inputs, outputs: name of a file or setting -> fingerprint: SHA-256 of the file, or value of the setting as JSON.
+        seconds: duration of the step [s].
+        command: command that ran the step.
+        seed: seed of all random numbers.
+        toolkit: versions of the toolkit and its libraries.
+        notes: notes for the user.
     """
 
     finished: Text
