@@ -56,12 +56,12 @@ class TiltEffect:
 
 @dataclass(frozen=True)
 class CalibrationChange:
-    """Change of a parameter from the nominal to the calibrated geometry.
+    """Difference of a parameter between the estimates on the nominal and on the calibrated geometry.
 
     Attributes:
         name: name of the parameter.
-        sigmas: the change, divided by the parameter's total σ.
-        percent: the change in percent of the value on the calibrated geometry.
+        sigmas: nominal minus calibrated estimate, divided by the parameter's total σ.
+        percent: nominal minus calibrated estimate, in percent of the calibrated one.
     """
 
     name: str
@@ -121,7 +121,7 @@ class GeometricEffect(NamedTuple):
     Attributes:
         rank: rank of the element by `shift_sigma`, from 1.
         element, unit: name and unit (m or rad) of the element.
-        sigma: σ of the element; NaN if it was not fitted.
+        sigma: σ of the element; not finite, or None in the file, if it was not fitted.
         matters: ``yes`` if the element alone raises the σ of some parameter by more than 1 %, else ``no``; empty
             without σ.
         parameter: name of the parameter that the element shifts most; empty if it shifts none.
