@@ -24,6 +24,7 @@ from calib.identification.loop import (
 from calib.identification.prediction import Score
 from calib.identification.rows import Case
 from calib.procedure.dynamic_stage import geometry_tables
+from calib.procedure.dynamic_stage.computed_torque import torque_tests
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
@@ -201,6 +202,7 @@ def report_section(
     exported: Sequence[str] = (),
     tolerance: float = 0.0,
     delivered: float | None = None,
+    tolerances: Sequence[float] = (),
 ) -> page.Section:
     """Return the report section on the dynamics: errors on held-out motion, torques, excitation, and parameters.
 
@@ -210,9 +212,12 @@ def report_section(
         exported: remarks on the export.
         tolerance: largest acceptable torque error on held-out motion [%]; 0: no tolerance.
         delivered: torque error of the exported robot on held-out motion [%]; None: unknown.
+        tolerances: largest acceptable rms torque error of each joint, or one for all [N m or N]; empty: none.
     """
     metrics, unseen = report.metrics, report.unseen
     blocks: list[page.Block] = [_error_table(unseen), _reference_table(unseen), _interval_table(unseen)]
+    if tolerances:
+        blocks.insert(0, _test_table(unseen, tolerances))
 
     torque_figures = [name for name in figures if name.startswith("torque_")]
     blocks.append(page.pictures("", figures, ("errors", "residuals")))
@@ -236,6 +241,16 @@ def report_section(
     blocks.append(page.Text("Notes on the dynamics", as_notes(warnings_of(report), noticed), "note"))
     key_figures = _key_figures(unseen, tolerance, delivered)
     return page.Section("Dynamics", blocks, unseen.verdict, unseen.reason, key_figures)
+
+
+def _test_table(unseen: UnseenReport, tolerances: Sequence[float]) -> page.ReportTable:
+    """Return the table of the computed-torque test: rms error of each torque row beside its tolerance."""
+    rows = []
+    for test in torque_tests(tolerances, unseen.proofs, unseen.rows):
+        met = "yes" if test.passed else "no"
+        rows.append([test.row, f"{test.rms:.3g}", f"{test.tolerance:g}", met, test.recording])
+    header = ("torque", "rms error [N m or N]", "tolerance", "within", "recording")
+    return page.ReportTable("Computed-torque test on unseen motion", header, rows, numbers=[1, 2])
 
 
 def _parameter_table(estimate: Sequence[IdentifiedParameter]) -> page.ReportTable:

@@ -123,7 +123,8 @@ def _dynamics(session: Session) -> StageRecord:
     predicted = prediction(session.path(session.export))
     delivered = None if predicted is None else predicted.exported
     exported = read_state(session).notes("export")
-    section = dynamics_section.report_section(report, figures, exported, allowed, delivered)
+    tolerances = session.settings.dynamics.tolerance_torque
+    section = dynamics_section.report_section(report, figures, exported, allowed, delivered, tolerances)
     verdict = session.verdicts().stages["dynamics"]
     section = replace(section, verdict=verdict.level, reason=verdict.reason)
     stage = dynamics_pages.stage(report, section, session.plots, allowed)
@@ -225,11 +226,13 @@ def _setup(session: Session, metrics: FitMetrics | None) -> list[Entry]:
         allowed = "none given: pass below 10 %"
         if section.tolerance_percent:
             allowed = f"{section.tolerance_percent:g} % on unseen motion"
+        joint_tolerances = ", ".join(f"{tolerance:g}" for tolerance in section.tolerance_torque)
         payloads = ", ".join(_payloads(session))
         rows += [
             ("recordings", _names(session.brought("training", "unseen"))),
             ("torques", TORQUES[section.torques]),
             ("tolerance of torque", allowed),
+            ("tolerance of joints' torques, rms", joint_tolerances and f"{joint_tolerances} N m or N"),
             ("payloads", payloads),
         ]
     rows += [
@@ -398,7 +401,7 @@ STEP = SessionStep(
         StepSetting("instrument"),
         StepSetting("poses"),
         StepSetting("fit"),
-        StepSetting("dynamics", ("torques", "payloads", "tolerance_percent")),
+        StepSetting("dynamics", ("torques", "payloads", "tolerance_percent", "tolerance_torque")),
         StepSetting("certificate"),
     ),
 )

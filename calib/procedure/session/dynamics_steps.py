@@ -29,6 +29,7 @@ from calib.identification.checks.recorded_motion import (
 from calib.identification.identify_options import FileSettings, IdentifyOptions, read_options
 from calib.procedure.dynamic_stage import identify as identifying
 from calib.procedure.dynamic_stage import inputs
+from calib.procedure.dynamic_stage.computed_torque import torque_tests
 from calib.procedure.dynamic_stage.identify import DynamicsAssessment, assess
 from calib.procedure.excitation import coefficients, prediction, stored_front
 from calib.procedure.excitation.coefficients import Periodic
@@ -521,14 +522,14 @@ def predict(session: Session, say: Say) -> list[str | Note]:
     assessment = assess(gathered, folder.dynamics(), folder.findings(), folder.errors(), progress=say)
     # the export is judged by the torques written here
     folder.unseen.write(gathered, assessment)
-    assessment = replace(assessment, verdict=_as_delivered(session, assessment))
+    assessment = replace(assessment, verdict=_as_delivered(session, gathered, assessment))
     folder.unseen.write(gathered, assessment)
     earlier = folder.metrics().warnings
     new_warnings = [warning for warning in assessment.warnings if warning not in earlier]
     return [*notes, str(assessment.verdict), *as_notes(new_warnings, assessment.noticed)]
 
 
-def _as_delivered(session: Session, assessment: DynamicsAssessment) -> Verdict:
+def _as_delivered(session: Session, gathered: inputs.IdentificationInputs, assessment: DynamicsAssessment) -> Verdict:
     """Return the verdict on the exported robot; for a model that cannot be exported, pass becomes prediction only.
 
     The verdict is fail if the torque error exceeds the tolerance in ``session.toml``.
@@ -553,8 +554,17 @@ def _as_delivered(session: Session, assessment: DynamicsAssessment) -> Verdict:
         error, model = predicted.exported, "exported robot"
         figure = f"{error:.2f} % of the torque unexplained by the exported robot"
         verdict = replace(verdict, reason=f"{figure} (identified model: {verdict.reason})")
-    tolerance = session.settings.dynamics.tolerance_percent
-    if not tolerance or error <= tolerance:
+    section = session.settings.dynamics
+    excesses = []
+    if section.tolerance_percent and error > section.tolerance_percent:
+        excesses.append(
+            f"the {model} has an error of {error:.2f} %, above the tolerance of {section.tolerance_percent:g} %"
+        )
+    rows = gathered.options.settings.torque_rows.titles(gathered.chain.joint_names)
+    tests = torque_tests(section.tolerance_torque, assessment.proofs, rows)
+    failed = [f"{test.row} {test.rms:.3g} (tolerance {test.tolerance:g})" for test in tests if not test.passed]
+    if failed:
+        excesses.append(f"rms torque errors [N m or N] of the identified model above tolerance: {', '.join(failed)}")
+    if not excesses:
         return verdict
-    excess = f"the {model} has an error of {error:.2f} %, above the tolerance of {tolerance:g} %"
-    return Verdict("fail", f"{verdict.reason}; {excess}")
+    return Verdict("fail", "; ".join([verdict.reason, *excesses]))

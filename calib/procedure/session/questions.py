@@ -105,7 +105,7 @@ class Question:
                 return camera and (answers.mounting or "").lower() not in UNSAID
             case "dynamics":
                 return not nothing
-            case "torques" | "payloads" | "goals" | "period" | "tolerance_percent":
+            case "torques" | "payloads" | "goals" | "period" | "tolerance_percent" | "tolerance_torque":
                 return answers.dynamics is not False
             case "front":
                 return answers.dynamics is not False and any("=" in goal for goal in answers.goals)
@@ -137,6 +137,7 @@ DEFAULTS = {
     "front": "0",
     "tolerance_mm": "0",
     "tolerance_percent": "0",
+    "tolerance_torque": "none",
     "details": "yes",
 }
 QUESTIONS = _questions()
@@ -240,6 +241,7 @@ def checked(answers: Answers) -> FieldValues:
         "front": answers.front,
         "tolerance_mm": answers.tolerance_mm,
         "tolerance_percent": answers.tolerance_percent,
+        "tolerance_torque": _joint_tolerances(answers.tolerance_torque or NONE),
     }
     result = {"robot": robot, "instrument": instrument, "dynamics": dynamics, "limits": limits}
     return result | {name: value for name, value in optional.items() if value and value != NONE}
@@ -262,6 +264,15 @@ def stated_payloads(texts: Sequence[str]) -> dict[str, dict[str, object]]:
         )
         payloads[label] = payload
     return payloads
+
+
+def _joint_tolerances(text: str) -> list[float]:
+    """Return the tolerances of the joints' torques [N m or N] from numbers with commas; an empty list for "none"."""
+    if _plain(text) in (*UNSAID, NONE):
+        return []
+    message = f"--tolerance-torque {text}: expected a number, or one per joint with commas, e.g. 2,2,1,0.5"
+    with refused_as(UsageError, ValueError, message):
+        return [Real(least=0, quantity="1").read(part) for part in text.split(",")]
 
 
 def _payload(text: str) -> tuple[str, dict[str, object]]:

@@ -199,7 +199,9 @@ FIT_OPTIONS = NamedFile("fit", "options")
 IDENTIFY_OPTIONS = NamedFile("dynamics", "options")
 # keys of [dynamics] on which the identified model depends
 MODEL_KEYS = ("torques", "friction", "method", "options", "payloads", "holdout")
-# and those of a designed motion
+# keys of [dynamics] on which its verdict depends
+TOLERANCES = ("tolerance_percent", "tolerance_torque")
+# keys of [dynamics] on which a designed motion depends
 DESIGN_KEYS = (
     "plan",
     "validation",
@@ -336,7 +338,7 @@ STEPS = (
         ),
         makes=("8-dynamics/unseen/*",),
         settings=(
-            StepSetting("dynamics", ("plan", "validation", "repeats", "tolerance_percent", *MODEL_KEYS)),
+            StepSetting("dynamics", ("plan", "validation", "repeats", *TOLERANCES, *MODEL_KEYS)),
             StepSetting("seed"),
         ),
         stage="dynamics",
