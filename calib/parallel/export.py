@@ -113,7 +113,7 @@ class OpenedRobot:
 
     @cached_property
     def rigid(self) -> list[Leg]:
-        """Legs with a rigid end: their last link is the platform. In the tree the first of them carries the platform."""
+        """Legs with a rigid end: their last link is the platform. In the tree the first leg carries the platform."""
         return [leg for leg in self.mechanism.robot.legs if leg.end == "rigid"]
 
     @property
@@ -198,7 +198,7 @@ class OpenedRobot:
             ET.SubElement(inertial, "origin", xyz=numbers_text(centre), rpy="0 0 0")
             ET.SubElement(inertial, "mass", value=repr(mass))
             values = [repr(float(moment)) for moment in moments]
-            inertia = dict(zip(INERTIA_KEYS, values))
+            inertia: dict[str, str] = dict(zip(INERTIA_KEYS, values))
             ET.SubElement(inertial, "inertia", inertia)
             add_joint(root, "platform_floating", "floating", "base", PLATFORM, self.mechanism.robot.home)
         for leg in self.closing:

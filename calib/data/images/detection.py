@@ -392,9 +392,10 @@ def detected(
         if progress:
             progress(number, count, name)
         try:
-            image = source
             if isinstance(source, Path):
                 image = read_image(source)
+            else:
+                image = source
         except MeasurementError as error:
             problem = str(error).removeprefix(f"{source}: ")
             detections[name] = Detection(blank, blank[:, 0], problem)
