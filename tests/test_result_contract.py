@@ -249,7 +249,7 @@ def test_a_verb_works_or_says_what_it_takes(kind, verb, results, tmp_path, capsy
     if folder.is_file():
         assert "give" in said
         return
-    nouns = [recognised.noun if recognised else "holds no result", "parallel robot"]
+    nouns = [recognised.noun if recognised else "contains no result", "parallel robot"]
     assert any(noun in said for noun in nouns[: 1 + kind.startswith("parallel")])
 
 

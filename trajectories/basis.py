@@ -179,7 +179,9 @@ def holding(
         first = [float(start[j]) for j in range(len(counts))]
     for j, value in (held or {}).items():
         if not 0 <= j < len(values) or not np.isfinite(value):
-            raise BadInput(f"joint {j + 1} of {len(values)} cannot be held at {value:g}")
+            raise BadInput(
+                f"joint {j + 1} of {len(values)} cannot be held at {value:g}; choose a joint and a finite value"
+            )
         if start is not None and start[j] != value:
             raise BadInput(f"joint {j + 1} is held at {value:g}, but the motion starts from {start[j]:g}")
         values[j] = none

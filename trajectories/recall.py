@@ -81,7 +81,9 @@ def find_periods(recorded: np.ndarray, reference: np.ndarray, skip: int = 0, lik
     if not (np.isfinite(q).all() and np.isfinite(r).all()):
         raise BadInput("recording or reference contain values that are not numbers: cut them out first")
     if len(q) < len(r):
-        raise BadInput(f"the recording has {len(q)} samples, less than one period of the motion ({len(r)})")
+        raise BadInput(
+            f"the recording has {len(q)} samples, less than one period of the motion ({len(r)}): record longer"
+        )
     similarity = _likeness(q, r)
     best = int(similarity.argmax())
     if similarity[best] < likeness:
@@ -92,7 +94,9 @@ def find_periods(recorded: np.ndarray, reference: np.ndarray, skip: int = 0, lik
     offsets = range(best % len(r), len(similarity), len(r))
     chain = [k for k in offsets if similarity[k] >= likeness]
     run = _run_with(chain, best, len(r))[skip:]
-    require(run, f"the recording contains fewer than {skip + 1} whole periods of the motion")
+    require(
+        run, f"the recording contains fewer than {skip + 1} whole periods of the motion: record more, or skip fewer"
+    )
     likenesses = tuple(float(similarity[k]) for k in run)
     return Recalled(run[0], len(r), len(run), likenesses, _lag(similarity, best))
 

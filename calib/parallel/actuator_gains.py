@@ -80,7 +80,7 @@ def drive_gains(
     names = [model.names[k] for k in base.kept]
     missing = [name for name in known_values if name not in names]
     if missing:
-        raise UsageError(f"'{missing[0]}' is not separately identifiable here; was the payload attached?")
+        raise UsageError(f"'{missing[0]}' is not separately identifiable from these runs; was the payload attached?")
     decimator = common_decimator(cases, settings)
     rows = []
     squares = []

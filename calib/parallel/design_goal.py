@@ -135,7 +135,7 @@ def read_model(robot: ParallelMechanism, folder: Path | None, drives: str = "") 
         model = replace(model, identical_legs=identical_legs, preload=preload)
     missing = [name for name in model.names[: model.inertial] if name not in stated_values]
     if missing:
-        raise RobotError(f"{path} is of another robot: parameter {missing[0]} is missing")
+        raise RobotError(f"{path} is of another robot (parameter {missing[0]} is missing): identify this robot")
     values = [stated_values.get(name, 0.0) for name in model.names]
     return model, np.array(values)
 

@@ -580,13 +580,15 @@ def _check(opened: OpenedRobot, text: str, where: str, postures: int = 5) -> Non
             gap_size = max(gap_size, largest_gap)
     if gap_size > MAX_DIFFERENCE:
         raise RobotError(
-            f"{where}: loops stay {gap_size:.2g} m (or rad) open when Pinocchio reads it; nothing was written"
+            f"{where}: loops stay {gap_size:.2g} m (or rad) open when Pinocchio reads it; nothing was written: "
+            "report this as a bug"
         )
     largest = max(1.0, float(np.abs(expected).max()))
     difference = float(np.abs(forces - expected).max()) / largest
     if difference > MAX_DIFFERENCE:
         raise RobotError(
-            f"{where}: forces differ by {difference:.2g} of the largest when Pinocchio reads it; nothing written"
+            f"{where}: forces differ by {difference:.2g} of the largest when Pinocchio reads it; nothing was written: "
+            "report this as a bug"
         )
 
 

@@ -280,7 +280,9 @@ def refuse_options_of_arms(settings: IdentificationSettings, options: IdentifyOp
     read = names - OF_ARMS
     refuse_unread(settings, IdentificationSettings(), read, options.source)
     if settings.friction not in ("auto", "standard"):
-        raise UsageError(f"friction = '{settings.friction}': a parallel robot has standard friction only (Fv Fc off)")
+        raise UsageError(
+            f"friction = '{settings.friction}': a parallel robot has standard friction only (Fv Fc off): remove the key"
+        )
     method = method_named(settings.method)
     if _of_arms(method):
         activity = "differentiates the torques of"

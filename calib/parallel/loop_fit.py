@@ -242,7 +242,7 @@ class ParallelFit(ChartedResult, ReportedResult):
         identified = count - len(fit.vague)
         lines = [
             f"{self.nominal.chain.name}: {identified} of {count} constants of the loops identified; "
-            f"encoders off by {fit.before:.3g}, calibrated by {fit.after:.3g} (rms, rad or m)"
+            f"encoder residuals {fit.before:.3g} nominal, {fit.after:.3g} calibrated (rms, rad or m)"
         ]
         for where, errors in self.judged.items():
             rms = 1e3 * np.sqrt(np.mean(errors**2, axis=1))

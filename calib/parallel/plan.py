@@ -219,7 +219,7 @@ def _read_waypoints(path: Path | np.ndarray, mechanism: ClosedRobot) -> np.ndarr
         posture = mechanism.locate(readings)
         return coordinates_of(mechanism, posture)
     except NoPosture as error:
-        raise MeasurementError(f"waypoint out of reach: {error}", path) from error
+        raise MeasurementError(f"waypoint out of reach: {error}; move it", path) from error
 
 
 def _law(robot: ParallelMechanism, folder: Path | None, payloads: tuple[str, ...]) -> _PlatformDynamics:

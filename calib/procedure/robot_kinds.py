@@ -156,7 +156,7 @@ def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None 
         return None
     stages = next(kind for kind in ROBOTS.all() if machine.kind == kind.KIND).stages()
     if verb not in stages:
-        advice = machine.instead.get(verb, f"{', '.join(stages)} take it")
+        advice = machine.instead.get(verb, f"use {', '.join(stages)}")
         name = machine.source
         if isinstance(robot, (str, Path)):
             name = robot

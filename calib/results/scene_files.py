@@ -118,7 +118,9 @@ def _meshes(chain: Chain | Drawn | None, source: Path | None) -> tuple[list[Visu
     moving = [mesh for mesh in meshes if mesh.link in links]
     notes = []
     if missing:
-        notes.append(f"{len(missing)} meshes of {source.name} were not found, e.g. {missing[0]}: links are lines")
+        notes.append(
+            f"{len(missing)} meshes of {source.name} were not found, e.g. {missing[0]}: their links are drawn as lines"
+        )
     return moving, notes
 
 

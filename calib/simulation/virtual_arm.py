@@ -107,7 +107,7 @@ def moving_arm(cell: Cell, robot: str, seed: int = 0, unmodelled: TorqueErrors =
     """
     nominal = cell.nominal
     if nominal.inertias is None:
-        raise CalibError(f"the library holds no masses for {robot}, so that its motion cannot be simulated")
+        raise CalibError(f"the library has no masses for {robot}, so that its motion cannot be simulated")
     rng = np.random.default_rng([seed, 71])
     bodies = [_perturbed(row, rng) for row in nominal.inertias]
     chain = replace(cell.truth.chain, inertias=np.array(bodies))

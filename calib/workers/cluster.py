@@ -49,7 +49,10 @@ class _Cluster:
             if threads:
                 self.manned = time_now
             elif time_now > self.manned + NO_WORKERS:
-                raise CalibError(f"the Dask scheduler at {self.address} has had no workers for {NO_WORKERS:g} s")
+                raise CalibError(
+                    f"the Dask scheduler at {self.address} has had no workers for {NO_WORKERS:g} s: start workers, "
+                    "then repeat the command"
+                )
         return self.threads
 
     def _said(self, ask: Callable[[], T]) -> T:
@@ -150,7 +153,7 @@ async def _answers(address: str) -> None:
 def dask(address: str) -> Iterator[_Cluster]:
     with refused_as(UsageError, ImportError, "a Dask scheduler needs Dask: pip install 'armature-calib[cluster]'"):
         from distributed import Client  # pyright: ignore[reportMissingImports]
-    with refused_as(UsageError, (OSError, ValueError), f"no Dask scheduler answers at {address}: {{}}"):
+    with refused_as(UsageError, (OSError, ValueError), f"no Dask scheduler answers at {address}: {{}}; is it running?"):
         with ThreadPoolExecutor(1) as executor:  # a notebook has a loop of its own
             executor.submit(asyncio.run, _answers(address)).result()
         client = Client(address, timeout=ANSWER, set_as_default=False)

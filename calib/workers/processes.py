@@ -257,8 +257,8 @@ class Processes:
         if self.stillborn < ATTEMPTS * self.count or self.stopping:
             return NotBegun()
         raise CalibError(
-            f"worker processes die at start ({how}): not enough memory, or the calling script lacks "
-            'if __name__ == "__main__"'
+            f"worker processes die at start ({how}): is memory short, or does the calling script lack "
+            'if __name__ == "__main__"?'
         )
 
     def settled(self) -> Iterator[Answer]:

@@ -159,7 +159,10 @@ class Excitation:
         """
         diagonal = np.diag(M)
         if not (diagonal > 0).all():
-            raise NotExciting(f"column {int(np.argmin(diagonal))} of the regressor is zero along the whole motion")
+            raise NotExciting(
+                f"column {int(np.argmin(diagonal))} of the regressor is zero along the whole motion: remove it, or "
+                "move more joints"
+            )
         if self.index == "trace":
             return self._trace(M)
         normalised = isinstance(self.scaling, str) and self.scaling == "normalised"

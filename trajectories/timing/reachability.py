@@ -168,7 +168,8 @@ def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
     if not np.isfinite(controllable).all():
         k = int(np.flatnonzero(~np.isfinite(controllable)).max())
         raise NothingFeasible(
-            f"no motion: no speed at {s[k] / s[-1]:.0%} of the path allows a stop at its end within the limits",
+            f"no motion: no speed at {s[k] / s[-1]:.0%} of the path allows a stop at its end within the limits: use "
+            "other waypoints or larger limits",
             "torque",
             float("nan"),
             "N m",
@@ -182,7 +183,8 @@ def fastest(rows: _Bounded, s: np.ndarray) -> Profile:
     if (x[1:-1] <= 0).any():
         k = int(np.argmax(x[1:-1] <= 0)) + 1
         raise NothingFeasible(
-            f"no motion: it comes to a stop at {s[k] / s[-1]:.0%} of the path, within these limits",
+            f"no motion: it comes to a stop at {s[k] / s[-1]:.0%} of the path, within these limits: use other "
+            "waypoints or larger limits",
             "torque",
             float("nan"),
             "N m",

@@ -48,7 +48,7 @@ def demo(
             demonstration.simulate_next(bring, say)
             return
         if hard and robot:
-            raise UsageError(f"--robot {robot}: --hard names a robot, too; leave one out")
+            raise UsageError(f"--robot {robot} and --hard both name a robot: leave one out")
         if hard:
             robot = demonstration.HARD
         result = demonstration.run(

@@ -146,7 +146,7 @@ def run(
     cell = virtual_cell(robot, seed)
     if dynamics and cell.nominal.inertias is None:
         supported = ", ".join(name for name in robot_names() if load(name).inertias is not None)
-        say(f"geometry only: masses are known of {supported}")
+        say(f"geometry only: masses are known for {supported} only")
         dynamics = False
     motion: dict[str, Any] = {}
     if dynamics:

@@ -284,7 +284,7 @@ def computed(
     goal = Goal(calibrated_cell, count, chain.lower, chain.upper)
     if start is not None and not _inside(nominal_goal, np.asarray(start)):
         limits = f"{chain.lower.tolist()} to {chain.upper.tolist()}"
-        raise UsageError(f"start {list(start)}: outside the joints' limits {limits}")
+        raise UsageError(f"start {list(start)}: outside the joints' limits {limits} [rad, m]: state values within them")
 
     say("the nominal robot at the targets")
     poses, nominal_q = _reference(nominal_goal, targets, start, seed)
@@ -529,7 +529,7 @@ def write(commands: Commands, out: Path, partial: bool = False) -> Path:
         head = f"{targets.file}: {lost} of {count} targets are not reached; nothing was written"
         message = "\n  ".join([head, *_unreached(commands)])
         if lost != count:
-            message += "\nwith partial (--partial), all other rows are written and these stay empty"
+            message += "\nwith partial (--partial), all other rows are written, and those above stay empty"
         raise UsageError(message)
 
     q = commands.q / (targets.factors or 1.0)

@@ -107,12 +107,12 @@ def placed(fitted: Fitted, program: Program, frame: str, statements: Statements)
                 tools[name] = _as_option(flange.pose @ pose)
                 notes.append(f"tool {name or 'active'}: {_in_words(pose)} in {flange}")
     elif len(tools) > 1:
-        refusals.append(f"--tool states one tool, the program has {listing(sorted(tools), 5)}: --frames FILE")
+        refusals.append(f"--tool states one tool, the program has {listing(sorted(tools), 5)}: give --frames FILE")
 
     user_names = {setting.user for setting in frames.settings}
     users = dict.fromkeys(user_names, np.eye(4))
     if in_station and statements.user is not None:
-        refusals.append(f"--user-frame and --frame {frame} both say where the user frame is: state one of them")
+        refusals.append(f"--user-frame and --frame {frame} both state the user frame: give one of them")
     if in_station:
         notes.append(f"user frame {listing(sorted(users), 5)}: that of station '{frame}', as calib deliver gives it")
     else:
@@ -125,7 +125,7 @@ def placed(fitted: Fitted, program: Program, frame: str, statements: Statements)
                 notes.append(f"user frame {name or 'active'}: {_in_words(pose)} in {base}")
     if refusals:
         count = len(frames.settings)
-        head = f"{program.path}: its {count} poses stand in frames that are not known; nothing was written"
+        head = f"{program.path}: the frames of its {count} poses are missing or contradictory; nothing was written"
         raise UsageError("\n  ".join([head, *refusals]))
     if not in_station:
         warnings = [base.warning, flange.warning]
@@ -221,19 +221,19 @@ def _completed(
     if statement is not None and len(missing) == 1:
         return result | {missing[0]: statement}
     if statement is not None and missing:
-        refusals.append(f"{option} states one {label}, {len(missing)} have no numbers: --frames FILE instead")
+        refusals.append(f"{option} states one {label}, but {len(missing)} have no values: give --frames FILE instead")
     elif statement is not None:
         # no frame lacks numbers: the statement has to agree with those that were read
         for name, pose in result.items():
             if np.abs(pose - statement).max() > AGREE:
-                difference = f"{label} {name} is {_in_words(pose)} in the program's files"
-                refusals.append(f"{option} says {_in_words(statement)}, {difference}")
+                difference = f"but {label} {name} is {_in_words(pose)} in the program's files: correct one of them"
+                refusals.append(f"{option} states {_in_words(statement)}, {difference}")
     for name in missing:
         location = f"line {listing(lines[name], 3)}"
-        subject = f"the {label} that is active"
+        subject = f"the active {label}"
         if name:
             subject = f"{label} {name}"
-        refusals.append(f"{subject} ({location}) has no numbers here: {_advice(program, kind, option)}")
+        refusals.append(f"{subject} ({location}) has no values in these files: state {_advice(program, kind, option)}")
     return result
 
 

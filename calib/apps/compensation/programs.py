@@ -96,7 +96,7 @@ class CompensatedProgram:
                 notes += [line for line in lines(part.commands) if not line.startswith("not reached")]
         # a note that several parts have is said once
         result = list(dict.fromkeys(notes))
-        result += [f"not reached, left as it was: {reason}" for reason in self.lost]
+        result += [f"not reached, target unchanged: {reason}" for reason in self.lost]
         if self.program.unread:
             result.append(self.program.unread)
         return result
@@ -113,7 +113,7 @@ class CompensatedProgram:
             head = f"{self.program.path}: {len(lost)} of {count} targets are not reached; nothing was written"
             message = "\n  ".join([head, *lost])
             if len(lost) != count:
-                message += "\nwith --partial, these stay as they are"
+                message += "\nwith --partial, all other targets are written, and those above stay unchanged"
             raise UsageError(message)
         return files.write(out, self.program.rewritten(self.values))
 
@@ -149,7 +149,9 @@ def compensated(
     n = fitted.nominal.chain.n
     if joints and len(program.targets[joints[0]].values) != n:
         axes = len(program.targets[joints[0]].values)
-        raise UsageError(f"{program.path}: its targets have {axes} axes, the robot has {n} joints")
+        raise UsageError(
+            f"{program.path}: its targets have {axes} axes, but the robot has {n} joints: is it for another robot?"
+        )
     groups, notes = (), ()
     if poses:
         placement = placed(fitted, program, frame, statements)
@@ -177,11 +179,11 @@ def _check_postures(fitted: Fitted, program: Program, groups: Sequence[Group], s
             silent += group.indices
     if silent:
         location = f"{len(silent)} targets (the first in line {program.targets[min(silent)].line})"
-        cause = "the program does not say elbow or wrist"
+        cause = "the program does not state the configuration of elbow and wrist"
         if not spherical and any(group.configuration for group in groups):
-            cause = "configurations are read for arms whose last three axes meet, which this is not"
+            cause = "configurations are read only for arms whose last three axes meet in a point, unlike this arm"
         raise UsageError(
-            f"{program.path}: {location} are poses, and {cause}; give joints near them: --start q1,...,qn [rad]"
+            f"{program.path}: {location} are poses, and {cause}; give joint values near them: --start q1,...,qn [rad]"
         )
 
 
@@ -219,7 +221,7 @@ def _without(commands: Commands, reasons: Sequence[str]) -> Commands:
     for k, reason in enumerate(reasons):
         if reason:
             reached[k] = False
-            command_reasons[k] = f"{reason}; --start takes the posture nearest to it"
+            command_reasons[k] = f"{reason}; with --start q1,...,qn the posture nearest to it is taken"
     return replace(commands, reached=reached, reason=tuple(command_reasons))
 
 
@@ -240,13 +242,11 @@ def _posture_notes(
         notes.append(f"warning: line {lines[k]}: {sought.reasons[k]}; {outcome}")
     against = lines[reached & sought.contradicted & ~unfit]
     if len(against):
-        message = f"the posture nearest to --start is not that of {configuration.text}, which is followed"
+        message = f"the posture nearest to --start is not that of {configuration.text}; the latter is taken"
         notes.append(f"line {listing(against.tolist(), 5)}: {message}")
     chain = commands.fitted.nominal.chain
     crossing = lines[reached & ~unfit & ~configuration.holds(program.controller, chain, commands.q)]
     if len(crossing):
-        message = (
-            f"the command crosses the boundary of {configuration.text}, which stays in the program: change it there"
-        )
+        message = f"the new joint values are outside {configuration.text}, which stays in the program: change it there"
         notes.append(f"warning: line {listing(crossing.tolist(), 5)}: {message}")
     return tuple(notes)

@@ -382,14 +382,14 @@ def _objection(
         started: whether a start is given, which decides between several postures.
     """
     if not len(agreeing) and configuration.agrees(chain, reached).any():
-        return f"{configuration.text} has no posture at this pose: none within the joints' limits has its turns"
+        return f"{configuration.text} has no posture at this pose: none within the joints' limits has the stated turns"
     if not len(agreeing):
         signs = signs_at(chain, reached, np.array(configuration.upright))
         alternatives = "; ".join(_sign_text(row) for row in np.unique(signs, axis=0))
         required = _sign_text(np.array(configuration.signs())) or "turns only"
         return f"{configuration.text} ({required}) is no posture at this pose; the arm reaches it with {alternatives}"
     if len(agreeing) > 1 and not started:
-        return f"{configuration.text} leaves {len(agreeing)} postures"
+        return f"{configuration.text} is ambiguous: {len(agreeing)} postures agree with it"
     return ""
 
 

@@ -49,7 +49,7 @@ def delivery_text(
     frames = base_frame(controller, arm, world), flange_frame(controller, arm, flange)
     verdicts = open_result(fit, "deliver").verdicts
     lines = [f"{controller.title}: calibration of {robot.chain.name}", str(verdicts), ""]
-    lines += [f"It takes: {controller.takes}.", f"It does not: {controller.closed}.", ""]
+    lines += [f"The controller accepts: {controller.takes}.", f"It does not accept: {controller.closed}.", ""]
     if len(nominal.tools):
         lines += [
             "Frames if the controller's geometry and mastering stay as they are:",

@@ -174,7 +174,7 @@ def base_frame(controller: Controller, arm: Description, statement: np.ndarray |
         joint = arm.moving_joint(link)
         return ControllerFrame(name, None, f"not known: link '{link}' moves with joint '{joint}'; {state}")
     if not footed and ruled is not None and _differs(pose, ruled):
-        basis = f"not known: link '{link}' is the description's root, and {name} stands {rule}; {state}"
+        basis = f"not known: link '{link}' is the description's root, and {name} is usually {rule}; {state}"
         return ControllerFrame(name, None, basis)
     relation = _relation(pose, chain.base)
     if footed:
@@ -183,7 +183,7 @@ def base_frame(controller: Controller, arm: Description, statement: np.ndarray |
             relation = _relation(pose_on_foot, foot)
     warning = ""
     if ruled is not None and _differs(pose, ruled):
-        warning = f"link '{link}' does not stand where {name} usually does ({rule}): compare with the pendant"
+        warning = f"link '{link}' is not where {name} usually is ({rule}): compare with the pendant"
     return ControllerFrame(name, pose, f"link {link}, {relation}", warning)
 
 
@@ -225,7 +225,7 @@ def _by_rule(controller: Controller, arm: Description) -> tuple[np.ndarray | Non
     """
     foot = arm.prefix + "base_link"
     if not controller.base_at:
-        return None, f"nothing is known of {controller.title}"
+        return None, f"the base frame of {controller.title} is not documented"
     start = arm.chain.base
     if arm.has(foot):
         start = foot
@@ -235,11 +235,11 @@ def _by_rule(controller: Controller, arm: Description) -> tuple[np.ndarray | Non
     if controller.base_at == "axis 2":
         height = _height_of_axis_2(arm.chain, placed)
         if height is None:
-            return None, f"{controller.base}'s height, that of axis 2, is none in this arm"
+            return None, f"{controller.base} is at the height of axis 2, which this arm does not determine"
         rule = f"by rule at the height of axis 2, {height:.6g} m above {start}"
         return placed @ from_xyz_rpy([0.0, 0.0, height], NO_TURN), rule
     if not arm.has(foot):
-        return None, f"there is no link '{foot}' against which {controller.base} stands"
+        return None, f"no link '{foot}', relative to which {controller.base} is defined"
     if controller.base_at == "turned":
         turned = placed @ from_xyz_rpy(NO_SHIFT, [0.0, 0.0, np.pi])
         return turned, f"by rule {foot}, turned by 180° about z"

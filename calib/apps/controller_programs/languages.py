@@ -70,7 +70,9 @@ def frames_in(program: Program, further: Mapping[str, str] | None = None) -> Pro
     """
     language = LANGUAGES.get(program.controller.language)
     if language is None:
-        raise UsageError(f"{program.path}: tool and user frames of {program.controller.title} are not read")
+        raise UsageError(
+            f"{program.path}: frames in programs of {program.controller.title} are not read; give the targets as a CSV"
+        )
     blank = language.without_comments(program.text)
     settings = tuple(language.setting(blank, program.targets[k]) for k in program.of("pose"))
     tools: dict[str, np.ndarray] = {}
@@ -81,7 +83,7 @@ def frames_in(program: Program, further: Mapping[str, str] | None = None) -> Pro
         for kind, frames in zip((tools, users), numbers):
             for name, pose in frames.items():
                 if name in kind and np.abs(kind[name] - pose).max() > 1e-9:
-                    raise UsageError(f"{file}: {name} is given twice, with other numbers")
+                    raise UsageError(f"{file}: {name} is given twice with different values; remove one")
                 kind[name] = pose
     tools |= dict.fromkeys(language.flange, np.eye(4))
     users |= language.base()
@@ -216,7 +218,8 @@ def _krl_setting(text: str, target: Target) -> Setting:
     if data is not None:
         if re.search(r"(?i)IPO_FRAME\s+#TCP", data[0]):
             raise UsageError(
-                f"line {target.line}: {point[1]} moves about a tool in the cell (IPO_FRAME #TCP): not read"
+                f"line {target.line}: {point[1]} is relative to a tool fixed in the cell (IPO_FRAME #TCP), which is "
+                "not supported: use a tool on the flange"
             )
         return Setting(_krl_name("TOOL", data[1]), _krl_name("BASE", data[2]), configuration)
     moves = re.finditer(rf"(?im)^\s*S?(?:PTP|LIN|CIRC)\b[^\n]*\b{re.escape(point[1])}\b", text)
@@ -314,14 +317,22 @@ def _rapid_numbers(text: str, controller: Controller) -> tuple[Frames, Frames]:
     tools: Frames = {}
     for match in _RAPID_TOOL.finditer(text):
         if match[2].upper() == "FALSE":
-            raise UsageError(f"tooldata {match[1]}: a tool that the robot does not hold (robhold FALSE) is not read")
+            raise UsageError(
+                f"tooldata {match[1]}: a tool fixed in the cell (robhold FALSE) is not supported: use one on the flange"
+            )
         tools[match[1].lower()] = _posed(match, 3, controller, 7)
     users: Frames = {}
     for match in _RAPID_WORK.finditer(text):
         if match[2].upper() == "TRUE":
-            raise UsageError(f"wobjdata {match[1]}: a work object that the robot holds (robhold TRUE) is not read")
+            raise UsageError(
+                f"wobjdata {match[1]}: a work object on the robot (robhold TRUE) is not supported: use one fixed in "
+                "the cell"
+            )
         if match[3].upper() == "FALSE" or match[4]:
-            raise UsageError(f"wobjdata {match[1]}: a work object on a moving mechanical unit is not read")
+            raise UsageError(
+                f"wobjdata {match[1]}: a work object on a moving mechanical unit is not supported: use one fixed in "
+                "the cell"
+            )
         user_frame = _posed(match, 5, controller, 7)
         object_frame = _posed(match, 12, controller, 7)
         users[match[1].lower()] = user_frame @ object_frame

@@ -44,7 +44,7 @@ def joints_in(path: Path, source: str = "") -> tuple[np.ndarray, list[str]]:
     if source or is_program(path):
         program = read_program(path, source)
         if not program.of("joints"):
-            raise UsageError(f"{path}: its targets are poses of the tool, not joints")
+            raise UsageError(f"{path}: its targets are poses of the tool; give a list or program of joint values")
         q = program.joints()
         return q, [f"q{number}" for number in range(1, q.shape[1] + 1)]
 
@@ -58,10 +58,10 @@ def joints_in(path: Path, source: str = "") -> tuple[np.ndarray, list[str]]:
         elif unit.lower() in ANGLES:
             names.append(name)
     if sliding:
-        raise UsageError(f"{path}: programs have turning joints only; {', '.join(sliding)} slides")
+        raise UsageError(f"{path}: programs are for revolute joints only, not lengths: {', '.join(sliding)}")
     if not names:
         columns = ", ".join(table.header)
-        raise UsageError(f"{path}: no column of joint angles, as 'joint1 [deg]'; found {columns}")
+        raise UsageError(f"{path}: no column of joint angles with its unit, as 'joint1 [deg]'; found {columns}")
     return read_poses(path, names), names
 
 
@@ -119,7 +119,7 @@ def program_files(
         q, names = joints_in(path, source)
     check_controller(name, q.shape[1], settings.pulses)
     if settings.output is not None and not controller.outputs:
-        raise UsageError(f"--output: {controller.title} raises no output; the operator presses a key")
+        raise UsageError(f"--output: in programs for {controller.title} the operator presses a key; leave it out")
     values: dict[str, object]
     if moving:
         templates = controller.stream

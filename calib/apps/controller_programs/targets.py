@@ -211,7 +211,7 @@ def read_program(path: Path, controller: str = "") -> Program:
     if not targets:
         moves = listing(_lines_of_moves(text, kind), 3)
         moves_message = f"its moves are in line {moves}" if moves else "nor any moves"
-        message = f"has no targets with all their numbers, as {kind.title} writes them; {moves_message}"
+        message = f"has no complete targets in the form that {kind.title} writes; {moves_message}"
         raise MeasurementError(message, path)
     targets.sort(key=lambda target: target.spans[0])
     return Program(path, kind, text, tuple(targets))

@@ -87,7 +87,7 @@ class FleetReport(ReportedResult):
             RecordColumn("from", _earlier_folder, False),
             RecordColumn("to", _later_folder, False),
             RecordColumn("tool moved, mm rms", _moved_mm),
-            RecordColumn("σ of that", _expected_mm),
+            RecordColumn("expected from σ", _expected_mm),
             RecordColumn("p", "{0[1].geometry.probability:.1g}"),
             RecordColumn("", "{0[1].verdict.level}", number=False),
         ]

@@ -45,9 +45,13 @@ def sessions(address: str) -> list[str]:
     if not is_address(address):
         return []
     files, root = _opened(address)
-    with refused_as(UsageError, Exception, f"{address} cannot be read: {{}}"):
+    with refused_as(UsageError, Exception, f"{address} cannot be read: {{}}; check address and access"):
         session_paths = sorted(files.glob(f"{root}/{SESSION}"))
-    require(session_paths, f"{address}: no session is there ({SESSION})", UsageError)
+    require(
+        session_paths,
+        f"{address}: no session ({SESSION}) is there; give the folder that contains the sessions",
+        UsageError,
+    )
     return [files.unstrip_protocol(path.rpartition("/")[0]) for path in session_paths]
 
 

@@ -57,10 +57,10 @@ def visits(calibrations: str | Path | Sequence[str | Path]) -> Visits:
         visits_by_arm.setdefault(arm, []).append((source, calibration))
 
     finished_count = len(places) - len(unfinished)
-    counts = f"{finished_count} of {len(places)} left, nothing to compare"
+    counts = f"{finished_count} of {len(places)} have one, too few to compare"
     message = f"sessions without a verdict yet: {listing(unfinished)}; {counts}"
     enough = finished_count > 1 or not unfinished
-    require(enough, f"{message} (calib next, or calib run, goes on with them)", UsageError)
+    require(enough, f"{message}; continue them with calib next or calib run", UsageError)
 
     unnamed = []
     current = []

@@ -194,9 +194,9 @@ def begin(chain: Chain, run: Run) -> tuple[Installation, Clock, tuple[float, ...
     if best_misfit > min(MAX_RATIO * extent, MAX_MISFIT * chain.stretched_length()):
         refuse_data(
             run.stream.file,
-            f"at no offset of the clocks its points are on the path of the nominal arm by {run.log.file} (the best "
+            f"no offset of the clocks puts its points on the nominal arm's path of {run.log.file} (the best "
             f"leaves {1e3 * best_misfit:.3g} mm of a motion of {1e3 * extent:.3g} mm): is it the log of this "
-            "motion, and of this robot, did instrument and target stay in place, and did no clock jump? "
+            "motion and of this robot, did instrument and target stay in place, and did no clock jump? "
             f"({'; '.join(run.lines())})",
         )
     alike = [start for start in starts if start.misfit < RIVAL * best_misfit]

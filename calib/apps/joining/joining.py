@@ -49,7 +49,7 @@ from calib.units import TIMES
 
 METHODS = ("name", "time", "row", "geometry", "motion")
 # requirements of each method except motion, for messages
-REQUIREMENTS = ("both files need a column of names (name, pose, id …)", "of times (t)", "as many rows", "give --robot")
+REQUIREMENTS = ("both files need names (a column name, pose, id …)", "times (column t)", "as many rows", "give --robot")
 
 # Thresholds are our choice.
 # largest distance of two readings of one pose [m], where their scatter is not known
@@ -99,7 +99,7 @@ def join(
         robot = load_calibrated(robot, base, tip)
     if by == "motion":
         if robot is None:
-            raise UsageError("by motion the clocks are found from the nominal arm's path: give --robot")
+            raise UsageError("joining by motion needs the nominal arm's path: give --robot")
         return join_streams(joints_file, points_file, robot.complete)
     if is_program(joints_file):
         joint_table = joints_table(joints_file)
@@ -131,7 +131,9 @@ def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joine
     elif by == "name":
         pose = _same_names(joints, points, *name_columns)
         if not (pose >= 0).any():
-            raise MeasurementError(f"{points.file}: no name is one of {joints.file}")
+            raise MeasurementError(
+                f"{points.file}: none of its names is in {joints.file}: name the poses alike in both files"
+            )
     else:
         pose = np.arange(len(points))
     if chain is not None and by != "time":
@@ -183,19 +185,19 @@ def ordered(
         limit = 1e3 * MAX_MISFIT * chain.stretched_length()
         refuse_data(
             points.file,
-            f"its {len(measured)} points are not those of these {len(q)} poses in {searched} (within {limit:.0f} mm of "
-            f"the nominal arm): is it this robot and this list, and did instrument and target stay in place?{advice}",
+            f"its {len(measured)} points do not fit the {len(q)} poses in {searched} (within {limit:.0f} mm of "
+            f"the nominal arm): is this the right robot and list, and did instrument and target stay in place?{advice}",
         )
     pose = np.full(len(position), -1)
     pose[measured] = order.pose
     notes = [f"{len(measured)} points, {order.origin} ({1e3 * order.rms:.2g} mm rms from the nominal arm)"]
     strange = measured[order.pose < 0]
     if len(strange):
-        notes.append(f"belonging to no pose, left out: rows {listing(points.rows[strange])}")
+        notes.append(f"left out, since they are near no pose: rows {listing(points.rows[strange])}")
     if order.rivals:
         doubtful = measured[list(order.rivals)]
         pose[doubtful] = -1
-        notes.append(f"poses too close together to tell apart, left out: rows {listing(points.rows[doubtful])}")
+        notes.append(f"left out, since several poses are equally near: rows {listing(points.rows[doubtful])}")
     return pose, tuple(notes)
 
 
@@ -224,7 +226,7 @@ def merged(
     stray = points.rows[pose < 0]
     groups, inconsistent = _consistent(position, groups, label, points)
     if not groups:
-        raise MeasurementError(f"{points.file}: none of its {len(points)} points is left")
+        raise MeasurementError(f"{points.file}: none of its {len(points)} points belongs to a pose of {joints.file}")
     notes = [*notes, *inconsistent]
     if missing and name_missing:
         notes.append(f"without a point: {len(missing)} of {len(joints)} poses: {listing(missing)}")
@@ -255,7 +257,9 @@ def merged(
             errors = position[rows] - position[rows].mean(axis=0)
             squares = squares + (errors**2).sum(axis=0)
         sigma = 1e3 * np.sqrt(squares / repeats)
-        notes.append(f"{counted(repeats, 'repeated reading')} averaged, σ of one {np.mean(sigma):.2g} mm per axis")
+        notes.append(
+            f"{counted(repeats, 'repeated reading')} averaged, σ of one reading {np.mean(sigma):.2g} mm per axis"
+        )
         has_sigma = any(name.startswith("sigma") for name in point_names)
         if repeats >= MIN_REPEATS and not has_sigma and np.all(sigma):
             header += SIGMA.names

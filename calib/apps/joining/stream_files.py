@@ -35,7 +35,7 @@ MIN_ROWS = 200
 # smallest jump back of a clock that was restarted [s]
 RESTART = 1.0
 # reasons for which rows are ignored, for messages
-DAMAGED, LATE = "damaged, empty or not seen", "with a time not after the row before"
+DAMAGED, LATE = "damaged, empty or not seen", "with a time not after that of the row before"
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +181,7 @@ def read_stream(path: Path, kind: Kind) -> Stream:
         reasons = _reasons(dropped)
         if reasons:
             message += f" ({reasons})"
-        refuse_data(path, f"{message}: is it a stream, and one recording?")
+        refuse_data(path, f"{message}: is it a stream, recorded without interruption?")
     parts = [part for part in parts if len(part.t)]
     t = np.concatenate([part.t for part in parts])
     values = np.concatenate([part.values for part in parts])

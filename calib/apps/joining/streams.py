@@ -133,7 +133,7 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
     if len(rows) < MIN_ROWS:
         notes = "; ".join([*run.lines(), *lines_of([thinned])])
         message = (
-            "too few rows are independent: did a clock jump, or instrument or target move? Else measure for longer"
+            "too few rows are independent: did a clock jump, or did instrument or target move? Else measure for longer"
         )
         refuse_data(file, f"{message}, over more of the workspace ({notes})")
 
@@ -190,7 +190,7 @@ def _check_motion(recording: Stream, count: int, unit: str) -> None:
     """Raise MeasurementError for a recording whose first `count` columns hardly change; `unit` is printed with them."""
     travel = float(np.ptp(recording.values[:, :count], axis=0).max())
     if not travel > MIN_MOTION:
-        message = f"hardly moves (by {travel:.2g}{unit}), and without motion no clock is found: is the unit right?"
+        message = f"moves by only {travel:.2g}{unit}, too little to identify the clocks' offset: is the unit right?"
         refuse_data(recording.file, message)
 
 
@@ -205,7 +205,7 @@ def _refuse(step: Step | None, wander: float, run: Run, clock: Clock) -> NoRetur
     """
     file = run.stream.file
     if step is None:
-        message = f"the clocks' offset leaves a line of offset and drift by {1e3 * wander:.2g} ms"
+        message = f"the clocks' offset deviates from a line of offset and drift by {1e3 * wander:.2g} ms"
         refuse_data(file, f"{message}: cut the file into shorter parts, and join each part on its own")
     size = f"{1e3 * step.size:+.3g} ± {1e3 * step.sigma:.2g} ms"
     log_time = float(clock.controller(np.array(step.time)))

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 TABLE = "trends.csv"
 HEADER = ("column", "unit", "x", "dx [mm]", "dy [mm]", "dz [mm]")
-CAPTION = "Targets of repeated poses less the arm's prediction."
+CAPTION = "Targets of repeated poses minus the arm's prediction."
 
 
 @dataclass(frozen=True, eq=False)

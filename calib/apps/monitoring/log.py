@@ -151,7 +151,7 @@ class RobotLog(ChartedResult, ReportedResult, WithoutVerdict):
         ]
         panels = [
             Panel(errors_drawn, "error on unseen poses [mm]", xnames=dates),
-            Panel(motion_drawn, "the tool moved since the one before [mm]", xnames=dates),
+            Panel(motion_drawn, "motion of the tool since the last calibration [mm]", xnames=dates),
         ]
         return {"log": Chart(panels, 2.6, 2)}
 
@@ -246,7 +246,7 @@ def _check_same(attribute: str, names: Sequence[str], mixed: bool) -> None:
     Empty names are ignored.
     """
     different = list(dict.fromkeys(name for name in names if name))
-    message = f"the sessions have different {attribute} ({', '.join(different)}); --mixed takes them for one robot"
+    message = f"the sessions have different {attribute} ({', '.join(different)}); give --mixed if they are of one robot"
     require(len(different) < 2 or mixed, message, UsageError)
 
 

@@ -101,7 +101,7 @@ class Placements(GeometryFit):
             if frame.name.startswith(first):
                 yield str(frame)
         rms_mm = 1e3 * self.fit.errors[1].rms
-        yield f"{poses} poses, {rms_mm:.3g} mm rms residual; σ follows from it, the arm's random errors included"
+        yield f"{poses} poses, {rms_mm:.3g} mm rms residual (with the arm's random errors), from which σ is computed"
         yield from map(str, self.warnings)
         if poses < USUAL_POSES:
             yield f"{poses} poses are few: measure {USUAL_POSES}, with the wrist turned by 90° and more between them"

@@ -69,7 +69,9 @@ class Guard:
         """Return the response to a refused request, or to one that sets the token's cookie; None for other requests."""
         requested_host = request.headers.get("host", "")
         if not self._is_ours(requested_host):
-            return PlainTextResponse("This page is not served under that name: use the address printed.", 403)
+            return PlainTextResponse(
+                "This page is not served under this host name: open the address that calib serve printed.", 403
+            )
         if request.method != "GET":
             origin = request.headers.get("origin")
             other_origin = origin is not None and urlsplit(origin).netloc != requested_host
@@ -270,7 +272,7 @@ async def bring(request: Request) -> Response:
     kind = request.path_params["kind"]
     session = open_session(work.folder)
     if kind not in [name for name, _, _ in _kinds(session)]:
-        return PlainTextResponse("this session takes no such files", 404)
+        return PlainTextResponse("this session does not accept such files", 404)
     try:
         await uploads.receive(session, kind, request.headers.get("content-type", ""), request.stream())
     except ClientDisconnect:

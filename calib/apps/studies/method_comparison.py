@@ -130,7 +130,9 @@ def compare_methods(
     require(inputs.unseen, "methods are ranked on unseen motion: give a recording with --validate", UsageError)
     shared = overlaps(inputs.cases, inputs.unseen)
     if shared:
-        raise UsageError(f"{lines_of(shared)[0]}: cut them apart, log.npz@0:20 and log.npz@20:30")
+        raise UsageError(
+            f"{lines_of(shared)[0]}: state parts that do not overlap, such as log.npz@0:20 and log.npz@20:30"
+        )
     # Recordings that repeat the training motion do not rank methods, unless there are no others.
     repeated = repeated_motion(inputs.cases, inputs.unseen)
     validation = tuple(case for case in inputs.unseen if case.name not in repeated)
@@ -192,7 +194,9 @@ def caveats(inputs: IdentificationInputs, compared: Sequence[ComparedMethod]) ->
     else:
         for method in compared:
             if method.verdict is not None and method.verdict.level == "fail":
-                message = f"no method recommended: the model of {method.name} fails in calib identify, reason below"
+                message = (
+                    f"no method recommended: the model of {method.name} fails in calib identify for the reason below"
+                )
                 notes.append(Note(message))
                 break
     return list(dict.fromkeys(notes))

@@ -319,7 +319,7 @@ def make_page(
     blocks: list[Block] = [overview(conditions)]
     if len(conditions) > 1:
         blocks.append(torque_table(conditions))
-    blocks += [Text("How that was decided", RULE), Text("Figures", MEANING)]
+    blocks += [Text("How methods are recommended", RULE), Text("Figures", MEANING)]
     sections = [Section("", blocks)]
     all_columns = [column.name for column in COLUMNS]
     for summary in conditions:
@@ -410,12 +410,12 @@ def run_study(
         rows = read_rows(out)
     else:
         with opened(out) as store:
-            say(f"{len(store.rows)} rows are there")
+            say(f"{len(store.rows)} rows exist")
             with workers(where) as crew:
                 progress = run(study, store, crew, lambda progress: say(str(progress)))
             say("writing")
             rows = list(store.rows.values())
-            stored = f"{ROWS} holds {len(rows)} rows"
+            stored = f"{ROWS} contains {len(rows)} rows"
     counted, notes = _counted(study, rows)
     if not progress.lost and not counted:
         contents = "no rows"
@@ -425,7 +425,7 @@ def run_study(
         advice = "ask for 1 run or more (--runs)"
         if report_only:
             advice = "run the study first, or name its folder (--out)"
-        raise UsageError(f"nothing to report: {out} holds {contents}; {advice}")
+        raise UsageError(f"nothing to report: {out} contains {contents}; {advice}")
     versions = sorted({row.toolkit for row in counted})
     if len(versions) > 1:
         notes.append(f"rows were made by several versions: {', '.join(versions)}")

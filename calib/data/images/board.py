@@ -68,7 +68,7 @@ class Board:
             )
         if self.kind == "chessboard" and (self.columns + self.rows) % 2 == 0:
             squares = f"{self.columns} x {self.rows} squares"
-            raise ValueError(f"{squares} look the same upside down: take an even and an odd number")
+            raise ValueError(f"{squares} look the same upside down: take an even and an odd number of squares")
         if self.kind == "chessboard" and min(self.columns, self.rows) < 4:
             raise ValueError("a chessboard needs at least 4 squares in each direction")
         count = DICTIONARIES.get(self.dictionary, self.tags)

@@ -327,7 +327,9 @@ def _absent(image: np.ndarray, coarse: np.ndarray, board: Board, count: int, tho
             )
         dictionary_name = _other_dictionary(coarse, board)
         if dictionary_name:
-            return f"no markers of {board.dictionary}, but some of {dictionary_name}: state it in board.toml"
+            return (
+                f"no markers of {board.dictionary}, but some of {dictionary_name}: state this dictionary in board.toml"
+            )
     width = _sharpest(coarse)
     if width > UNSHARP:
         return f"no board found; the image's sharpest edges are {width:.0f} px wide: out of focus, or still moving"

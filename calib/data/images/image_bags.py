@@ -93,7 +93,7 @@ def read_image_bag(
     with opened(path) as reader:
         states = connections_of(reader, JOINT_STATE, joint_topic, path, "joint states", "--joint-topic")
         names, parts, _ = joint_states(reader, states, None, path)
-        few = f"{len(parts['q'])} joint states are too few to interpolate joint values"
+        few = f"{len(parts['q'])} joint states are too few to interpolate joint values: is the topic the right one?"
         require(len(parts["q"]) >= 2, few, MeasurementError, path)
         order = np.argsort(parts["stamp"], kind="stable")
         connections = connections_of(reader, IMAGE, image_topic, path, "images", "--image-topic")
@@ -135,7 +135,7 @@ def _grey(message: Any) -> np.ndarray:
     if hasattr(message, "format"):
         return decode(bytes(message.data))
     if message.encoding not in ENCODINGS:
-        raise ValueError(f"images of encoding '{message.encoding}'; known are {', '.join(ENCODINGS)}")
+        raise ValueError(f"images of encoding '{message.encoding}'; supported are {', '.join(ENCODINGS)}")
     kind, depth = ENCODINGS[message.encoding]
     order = ">" if message.is_bigendian else "<"
     height = message.height

@@ -123,7 +123,7 @@ def joint_table(path: Path) -> Table:
     table = read_table(file)
     for name, count in Counter(table.texts("image")).items():
         if count > 1:
-            raise MeasurementError(f"'{name}' occurs {count} times", file, column="image")
+            raise MeasurementError(f"'{name}' occurs {count} times: one row per image is needed", file, column="image")
     return table
 
 
@@ -242,7 +242,8 @@ def _lens_of_folder(path: Path, size: tuple[int, int], options: FileOptions) -> 
     lens = read_lens(file)
     if size[0] and lens.size != size:
         raise MeasurementError(
-            f"is for images of {lens.size[0]} x {lens.size[1]} pixels, the images here have {size[0]} x {size[1]}", file
+            f"is for images of {lens.size[0]} x {lens.size[1]} pixels, but the images here have {size[0]} x {size[1]}",
+            file,
         )
     return lens, True
 

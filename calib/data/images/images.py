@@ -46,7 +46,7 @@ def decode(content: bytes) -> np.ndarray:
     require(content, "the file is empty", ValueError)
     # libpng would write a complaint to the terminal
     if content.startswith(PNG) and b"IEND" not in content[-64:]:
-        raise ValueError("no image format that is known, or cut short")
+        raise ValueError("the image format is unknown, or the file is incomplete")
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     stored = np.frombuffer(content, np.uint8)
     try:
@@ -55,7 +55,7 @@ def decode(content: bytes) -> np.ndarray:
     except cv2.error as error:
         raise ValueError(str(error)) from error
     if pixels is None:
-        raise ValueError("no image format that is known, or cut short")
+        raise ValueError("the image format is unknown, or the file is incomplete")
     return to_grey(pixels)
 
 

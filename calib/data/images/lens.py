@@ -64,7 +64,9 @@ class Lens:
         if self.model not in NAMES or len(values) not in COUNTS[self.model]:
             raise CalibError(f"no camera model '{self.model}' with {len(values)} values; known: pinhole, fisheye")
         if not np.isfinite(values).all() or min(values[:2]) <= 0.0:
-            raise CalibError(f"camera: focal lengths {values[0]:g}, {values[1]:g} px are impossible")
+            raise CalibError(
+                f"camera: focal lengths {values[0]:g}, {values[1]:g} px are impossible: they must be above 0"
+            )
         object.__setattr__(self, "values", values)
 
     @property

@@ -157,7 +157,7 @@ def read_corners(path: Path, board: Board) -> Detections:
         rows = list(csv.DictReader(file, restkey="further cells", restval=""))
     for number, row in enumerate(rows, 1):
         if "further cells" in row:
-            refuse_data(path, "has more cells than the header names columns", row=number)
+            refuse_data(path, "has more cells than the header has columns: check its commas", row=number)
         cells = {}
         for heading, cell in row.items():
             key = (heading or "").split("[")[0].strip()
@@ -180,7 +180,7 @@ def read_corners(path: Path, board: Board) -> Detections:
             k = int(cells["corner"])
             corner_pixel = float(cells["u"]), float(cells["v"])
         if not 0 <= k < count:
-            refuse_data(path, f"corner {k}: the board ({board.words}) has {count}", "corner", number)
+            refuse_data(path, f"corner {k}: the board ({board.words}) has corners 0 to {count - 1}", "corner", number)
         images[name].pixel[k] = corner_pixel
         images[name].sigma[k] = float(cells.get("sigma") or USUAL)
     return Detections(images, size)

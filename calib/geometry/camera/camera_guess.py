@@ -98,7 +98,9 @@ def complete_camera(chain: Chain, block: Pixels, fitted_blocks: Sequence[PoseMea
         block = _with_fitted_lens(block, fitted_blocks)
     if block.lens is None:
         if not block.size[0]:
-            raise MeasurementError("image size unknown: no lens (camera.yaml) and no image was given", block.file)
+            raise MeasurementError(
+                "the image size is unknown, since neither a lens nor an image was given: give camera.yaml", block.file
+            )
         size = block.size
         lens = estimate_lens(block.board, block.pixel, size, block.model, block.file)
         block = replace(block, lens=lens)
@@ -132,7 +134,7 @@ def _with_fitted_lens(block: Pixels, fitted_blocks: Sequence[PoseMeasurements]) 
 def _lens_of(block: Pixels) -> Lens:
     """Return the lens of a block of images; raise if it is unknown."""
     if block.lens is None:
-        raise MeasurementError("the lens of these images is unknown", block.file)
+        raise MeasurementError("the lens of these images is unknown: give it (camera.yaml)", block.file)
     return block.lens
 
 
@@ -410,7 +412,7 @@ def optics_of(measured: Sequence[Pixels]) -> Optics:
     free = set[str]()
     for block in measured:
         if block.lens is None or not block.mounting:
-            refuse_data(block.file, "lens and mounting of the camera are unknown (see complete_camera)")
+            refuse_data(block.file, "lens and mounting of the camera are unknown: call complete_camera before the fit")
         lens = lenses.setdefault(block.camera, block.lens)
         if lens.size != block.lens.size or lens.model != block.lens.model:
             refuse_data(

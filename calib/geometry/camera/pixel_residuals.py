@@ -359,7 +359,7 @@ def _pixels(measured: Pixels, seen: Seen, jacobian: np.ndarray) -> list[Residual
     """Return the corner residuals r = y - π(point) of a block of images, with their Jacobians."""
     view = seen.view
     if view is None:
-        refuse_data(measured.file, "the camera of these images is unknown")
+        refuse_data(measured.file, "the camera of these images is unknown: give its lens (camera.yaml)")
     in_hand = measured.mounting == IN_HAND
     count = len(measured)
     lens_count = len(view.in_view)

@@ -241,7 +241,7 @@ def closed(robot: ParallelRobot) -> ClosedRobot:
             )
         rcond = float(_leg_rcond(leg_link, leg_link)[0])
         if rcond < SINGULAR:
-            robot.refuse(f"{leg.name} {_why_singular(robot, start, leg)}: rcond {rcond:.1g}")
+            robot.refuse(f"{leg.name} {_why_singular(robot, start, leg)} (rcond {rcond:.1g}): correct home or lengths")
     minors = tuple(_best_rows(link.jacobian[0]) for link in links)
     fixed = _check_freedom(robot, start, links)
     no_signs = np.zeros(len(links) + 1)
@@ -249,7 +249,10 @@ def closed(robot: ParallelRobot) -> ClosedRobot:
     rows = _reading_rows(opened, links)
     rcond = float(_platform_rcond(opened, rows, rows)[0])
     if rcond < SINGULAR:
-        robot.refuse(f"home is singular (type 2): locked actuators do not hold it, rcond {rcond:.1g}")
+        robot.refuse(
+            f"home is singular (type 2): locked actuators do not hold the platform (rcond {rcond:.1g}); state "
+            "another home"
+        )
     signs = frozen(_determinants(opened, links)[0])
     return ClosedRobot(robot, start, minors, signs, fixed)
 
@@ -636,7 +639,10 @@ def _check_freedom(robot: ParallelRobot, home: Posture, links: Sequence[LegLinks
             )
         if np.linalg.cond(free_motions[:, robot.selected]) > MAX_FREEDOM_CONDITION:
             motions = _motions(free_motions)
-            robot.refuse(f"the platform can move in {motions}; freedom lists {', '.join(robot.freedom)}")
+            robot.refuse(
+                f"the platform can move in {motions}, but the key 'freedom' lists {', '.join(robot.freedom)}: "
+                "correct it"
+            )
         violation = float(np.abs(constraints @ freedoms).max())
         fixed = fixed and violation < RANK_TOLERANCE
         if trial == FREEDOM_POSTURES - 1:

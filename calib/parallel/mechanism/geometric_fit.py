@@ -108,7 +108,9 @@ class LoopCovariance:
         by_name = {parameter.name: parameter for parameter in loop_parameters(mechanism)}
         missing = [name for name in self.names if name not in by_name]
         if missing:
-            refuse_robot(mechanism.robot.name, f"none of its loops has '{missing[0]}', which its covariance is of")
+            refuse_robot(
+                mechanism.robot.name, f"its covariance has the parameter '{missing[0]}', which none of its loops has"
+            )
         return tuple(by_name[name] for name in self.names)
 
 
@@ -184,7 +186,7 @@ def fit_loops(
         changes = changes + np.linalg.lstsq(rows, np.concatenate([residual, -pull * changes]), rcond=None)[0]
         mechanism = closed(changed(nominal.robot, parameters, changes))
     else:
-        raise NotConverged(f"the geometry of '{robot.name}' does not settle within {LIMIT} steps", mechanism)
+        raise NotConverged(f"the geometry of '{robot.name}' has not converged after {LIMIT} steps", mechanism)
     # Rows of the measurements, and of what was known of the parameters beforehand.
     white = np.vstack([W / max(std, 1e-12), np.eye(count) / SPREAD])
     inverse = np.linalg.inv(np.linalg.qr(white, mode="r"))

@@ -154,10 +154,16 @@ class ParallelPlant:
         standard = model.spread(values)
         term_values = standard[len(standard) - len(model.terms) :]
         for term, value in zip(model.terms, term_values):
-            require(term.shape in SHAPES, f"term '{term.name}' ({term.shape}) cannot be simulated", UsageError)
+            require(
+                term.shape in SHAPES, f"term '{term.name}' ({term.shape}) cannot be simulated: remove it", UsageError
+            )
             drives[term.joint, SHAPES[term.shape]] += value
             if term.shape == "sign":
-                require(term.settings[0] > 0.0, f"'{term.name}' cannot be simulated without v0 above 0", CannotSimulate)
+                require(
+                    term.settings[0] > 0.0,
+                    f"term '{term.name}' cannot be simulated: state its v0, above 0",
+                    CannotSimulate,
+                )
                 drives[term.joint, 4] = term.settings[0]
         bodies_values = []
         for (bodies, *_), parameters in zip(model.legs, model.leg_parameters(values)):

@@ -142,7 +142,7 @@ class ParallelModel:
             for leg in legs:
                 leg_kinds = [joint.kind for joint in leg.chain.joints]
                 if leg.bodies != first.bodies or leg_kinds != kinds:
-                    raise UsageError(f"identical_legs: {leg.name} is built unlike {first.name}")
+                    raise UsageError(f"identical_legs: {leg.name} is built unlike {first.name}; remove identical_legs")
         counts = Counter(self.names)
         doubled = sorted(name for name, count in counts.items() if count > 1)
         if doubled:

@@ -247,7 +247,7 @@ def summary(carried: GeometryUncertainty) -> str:
         sentence += f" and leaves {p - count} unchanged"
     dominated = _marked(carried.names, carried.dominated)
     if dominated:
-        sentence += f"; for {len(dominated)} it contributes more than torque noise: {', '.join(dominated)}"
+        sentence += f"; for {len(dominated)} the geometry contributes more than torque noise: {', '.join(dominated)}"
     return sentence
 
 

@@ -199,7 +199,7 @@ def gather(
         if shifts:
             effect = f"move the links by up to {1e3 * max(shifts):.3g} mrad or mm"
         else:
-            effect = "take no part: the links are rigid"
+            effect = "are not used: the links are rigid"
             described = described.without_corrections()
         notes.append(f"joint corrections of the geometric fit {effect}")
     return IdentificationInputs(
@@ -326,7 +326,7 @@ def read_motion(
         band=min(band, MAX_BAND * motion.rate),
     )
     wider = make_motion(recording, wider_options, sampled, motion.cutoffs)
-    note = f"f_p = {wider.band:.3g} Hz instead, so that decimation does not remove the ends of a short recording"
+    note = f"identification band f_p = {wider.band:.3g} Hz instead, to keep the ends of a short recording"
     return replace(wider, notes=(*motion.notes, note))
 
 
@@ -351,7 +351,7 @@ def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampl
     borders = 2.0 / cutoff if options.borders is None else options.borders
     sharper_options = replace(options, velocity_cutoff=_joints(motion.velocity_cutoff), borders=borders, cutoff=doubled)
     sharper = make_motion(recording, sharper_options, sampled, motion.cutoffs)
-    note = f"f_q = {doubled:.3g} Hz instead: the position noise is low enough"
+    note = f"cut-off of positions f_q = {doubled:.3g} Hz instead: the position noise is low enough"
     return replace(sharper, notes=(*motion.notes, note))
 
 
@@ -410,7 +410,11 @@ def _with_design(
             part = slice(start, stop)
             q_ref = frozen(design.orders(motion.t[part] - located.began)[0])
             return replace(motion.part(part), q_ref=q_ref, located=located.began)
-    refuse_data(motion.file, "has no reference positions (q_ref), and contains none of the designed motions whole")
+    refuse_data(
+        motion.file,
+        "has no reference positions (q_ref), and contains none of the designed motions whole: log the reference, or "
+        "record again",
+    )
 
 
 def _check_files(options: IdentifyOptions, paths: Sequence[str]) -> None:

@@ -56,7 +56,9 @@ class FoundGains:
         """
         if options.gains is not None:
             if len(options.gains) not in (1, motion.n):
-                raise UsageError(f"gains: {len(options.gains)} values for {motion.n} joints ({motion.file})")
+                raise UsageError(
+                    f"gains: {len(options.gains)} values for {motion.n} joints ({motion.file}): state one per joint"
+                )
             return np.broadcast_to(np.array(options.gains), (motion.n,))
         if motion.kind != "current":
             return None
@@ -95,8 +97,8 @@ def find_gains(
     with_gains = [path for path in motions if path not in bare_currents]
     if with_gains:
         raise UsageError(
-            f"{bare_currents[0]} holds currents without gains, {with_gains[0]} torques (or currents with gains): one "
-            "model cannot use both A and N m; state gains for all of them"
+            f"{bare_currents[0]} contains currents without gains, {with_gains[0]} torques (or currents with gains): "
+            "one model cannot use both A and N m; state gains for all of them"
         )
     say("relative drive gains")
     return _relative(chain, options, [(path, motions[path]) for path in training if path in bare_currents])
@@ -123,8 +125,8 @@ def _from_pair(chain: Chain, options: IdentifyOptions, pair: GainPair, motions: 
     files = ", ".join(Path(parse_cut(name)[0]).name for name in (*pair.unloaded, *pair.loaded))
     notes = (
         f"drive gains from {files} ({gains.scale}): {printed}",
-        f"gains and payload are estimated from {files}: no independent validation data; no σ of a parameter contains "
-        "that of the gains",
+        f"gains and payload are estimated from {files}, so these do not validate the model; the σ of parameters do not "
+        "contain the uncertainty of the gains",
         *_poor_gains(gains),
     )
     with_loads = replace(options, settings=replace(settings, payload_values=loads))
@@ -156,7 +158,8 @@ def _relative(chain: Chain, options: IdentifyOptions, currents: Sequence[tuple[s
         else:
             printed.append(f"{gain:.4g} ± {sigma:.2g}")
     notes = [
-        f"torques are {without_gains(unit)}; gains relative to it {', '.join(printed)}; for N m give gains, "
+        f"torques are {without_gains(unit)}; gains by joint, relative to that reference: {', '.join(printed)}; for N "
+        "m give gains, "
         "or [gain_identification] with a payload of known mass"
     ]
     if gains.own:
@@ -183,7 +186,7 @@ def _identify(
     base = find_base(model, cases, chain_states(chain, model, settings.seed))
     missing = [name for name in known_values if name not in [model.names[k] for k in base.kept]]
     if missing:
-        raise UsageError(f"'{missing[0]}' is not separately identifiable here; was the payload attached?")
+        raise UsageError(f"'{missing[0]}' is not separately identifiable from these runs; was the payload attached?")
     decimator = common_decimator(cases, settings)
     rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
     tau = first_fit(rows)[1]

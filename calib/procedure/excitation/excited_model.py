@@ -101,7 +101,9 @@ def read_model(
     model, derivative_notes = _differentiable(model)
     cases = loads_of(loads, payloads, with_payloads=True)
     if options is not None and options.friction not in ("auto", "standard"):
-        notes.append(f"designed for standard friction: the step '{options.friction}' has its terms from recordings")
+        notes.append(
+            f"designed for standard friction, since the terms of '{options.friction}' are chosen from recordings"
+        )
     if chain.inertias is None and np.isfinite(limits.torque).any():
         sizes = ", ".join(f"{size:g}" for size in dict.fromkeys(limits.torque.tolist()))
         notes.append(f"NOT checked: torques (limits {sizes}), since the robot has no masses; name a model (--model)")
@@ -207,7 +209,11 @@ def loads_of(texts: Sequence[str], payloads: Sequence[str], with_payloads: bool)
             labels = tuple(part.strip() for part in text.split("+"))
         for label in labels:
             where = f"load '{text}': payload"
-            require(payloads, f"{where} '{label}' is not known: options or model have no payloads", UsageError)
+            require(
+                payloads,
+                f"{where} '{label}' is not known, since options or model have no payloads: leave it out",
+                UsageError,
+            )
             one_of(label, payloads, where, UsageError)
         runs.append(labels)
     return tuple(runs)
@@ -256,7 +262,7 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str], nominal: Chain
     parameters = np.array([value_of[name] for name in model.names])
     if not np.isfinite(parameters).all():
         name = model.names[int(np.argmin(np.isfinite(parameters)))]
-        raise UsageError(f"{folder}: parameter {name} of the model is not finite")
+        raise UsageError(f"{folder}: parameter {name} of the model is not finite; identify again")
     friction = any(term.shape == "sign" for term in model.columns)
     excited = excited_model(model, loads, parameters, friction, notes, nominal)
     covariance = covariance_of(folder / COVARIANCE, excited.exact)
@@ -325,7 +331,10 @@ def excited_model(
     identifiable = {model.names[k].removeprefix(name) for k in base.kept for name in STANDARD}
     lost = [label for label in _payloads(model) if label not in identifiable]
     if lost:
-        notes = (*notes, f"payload {', '.join(lost)}: not identifiable from these loads; run others, too: --load none")
+        notes = (
+            *notes,
+            f"payload {', '.join(lost)}: not identifiable from these loads; add another load, such as --load none",
+        )
     return ExcitedModel(
         smooth=LoadCases(smooth, base, loads),
         exact=LoadCases(model, base, loads),

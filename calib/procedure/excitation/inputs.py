@@ -125,7 +125,7 @@ def read_inputs(
     model = model or after
     if settings.drives and (model is not None or options is not None):
         raise UsageError(
-            f"drives '{settings.drives}': {model or 'the options file'} states the drive terms; leave it out"
+            f"drives '{settings.drives}': {model or 'the options file'} states the drive terms; leave drives out"
         )
     calibrated, source = load_rigid(robot, None, base, tip)
     chain = calibrated.chain

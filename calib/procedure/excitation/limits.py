@@ -112,7 +112,7 @@ class MotionBounds:
             "acceleration",
             {"acceleration": self.acceleration, "effort": self.torque},
             "acceleration",
-            "; efforts count where masses are known or a model is named (--model)",
+            "; limits of effort are used only where masses are known or a model is named (--model)",
         )
 
     def _require(self, example: str, limits: Mapping[str, np.ndarray], quantity: str, hint: str) -> None:
@@ -138,7 +138,7 @@ class MotionBounds:
         for kind, sizes in limits.items():
             numbers += [f"{kind} {size:g}" for size in sizes[unlimited] if np.isfinite(size)]
         wrong = [number for number in dict.fromkeys(numbers) if number.split()[0] in limits]
-        remark = f" ({', '.join(wrong)} is no limit)" if wrong else ""
+        remark = f" ({', '.join(wrong)} is not a limit)" if wrong else ""
         raise UsageError(
             f"{self.robot}: no limit for the {quantity} of {self._named(joints)}{remark}; without it no motion "
             f"is written; state it {self.place.format(EXAMPLES[example])}{hint}"
@@ -365,7 +365,7 @@ def read_motion_limits(
         pairs = tuple(f"{link} - {obstacle}" for link, obstacle in collision.pairs)
         constraints.append(Clearance(collision.distances, collision.gradients, pairs, pose_limits.clearance))
         if pose_limits.checked:
-            notes.append(f"kept: {', '.join(pose_limits.checked)}")
+            notes.append(f"respected: {', '.join(pose_limits.checked)}")
         if pose_limits.unchecked:
             notes.append(f"NOT checked: {', '.join(pose_limits.unchecked)}")
     return MotionLimits(
@@ -568,6 +568,8 @@ def _friction(table: FrictionTable | None, chain: Chain, where: str) -> np.ndarr
     for key, coefficients in (("Fv", table.Fv), ("Fc", table.Fc)):
         joint_values = coefficients or (0.0,) * chain.n
         if len(joint_values) not in (1, chain.n):
-            raise UsageError(f"{where}: friction.{key}: {len(joint_values)} values for {chain.n} joints")
+            raise UsageError(
+                f"{where}: friction.{key}: {len(joint_values)} values for {chain.n} joints: state one per joint"
+            )
         result.append(np.broadcast_to(np.array(joint_values), (chain.n,)))
     return np.array(result)

@@ -444,6 +444,7 @@ def compared_with_identification(folder: Path, outcome: IdentificationOutcome) -
     ratio = sigma_ratio(predicted, identified, residual=residual, assumed=outlook.noise_share)
     if ratio is None:
         raise UsageError(
-            f"{folder} contains none of the {len(identified)} identified parameters: it belongs to another robot"
+            f"{folder} contains none of the {len(identified)} identified parameters, so it belongs to another robot: "
+            "give the excitation of this one"
         )
     return sentence(ratio)

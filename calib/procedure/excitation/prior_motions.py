@@ -175,7 +175,8 @@ def designed_orders(folder: Path, chain: Chain) -> tuple[np.ndarray, np.ndarray,
     motion = coefficients.read(folder)
     if motion.joint_names != tuple(chain.joint_names):
         raise UsageError(
-            f"{folder}: the motion has joints {', '.join(motion.joint_names)}; {chain.name} has "
+            f"{folder}: the motion is of another robot: it has joints {', '.join(motion.joint_names)}, "
+            f"{chain.name} has "
             f"{', '.join(chain.joint_names)}"
         )
     count = max(MIN_SAMPLES, round(MIN_RATE * motion.period))

@@ -111,7 +111,8 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
     difference = float(np.abs(tip_poses(edited, urdf_chain, q) - forward(urdf_chain, q)).max())
     if difference > MAX_DIFFERENCE:
         raise RobotError(
-            f"{where}: poses differ by {difference:.2g} when Pinocchio reads the URDF; nothing was written"
+            f"{where}: poses differ by {difference:.2g} when Pinocchio reads the URDF; nothing was written: report "
+            "this as a bug"
         )
 
     q = q[:CHECKED_AGAIN]
@@ -125,7 +126,10 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
     expected = [joint_frames(urdf_chain, q) @ np.stack(turns)[:, None], forward(urdf_chain, q)[None]]
     difference = float(np.abs(T_base_links - np.concatenate(expected)).max())
     if difference > MAX_DIFFERENCE:
-        raise RobotError(f"{where}: poses differ by {difference:.2g} when yourdfpy reads the URDF; nothing was written")
+        raise RobotError(
+            f"{where}: poses differ by {difference:.2g} when yourdfpy reads the URDF; nothing was written: report "
+            "this as a bug"
+        )
     return "Pinocchio and yourdfpy read the same poses to 1e-9"
 
 

@@ -125,8 +125,10 @@ def exported_prediction(robot: IdentifiedRobot, folder: Path) -> ExportedPredict
     None if the recordings were made with payloads, or if an earlier version did not store their velocities.
     """
     dynamics = without_left(robot.found.dynamics)
+    identification = IdentificationFolder(folder)
+    scores = identification.scores_of_torques()
     worst = None
-    for path in IdentificationFolder(folder).torques:
+    for path, score in zip(identification.torques, scores):
         motion = read_torques(path) if path.is_file() else {}
         if not motion:
             continue
@@ -135,6 +137,8 @@ def exported_prediction(robot: IdentifiedRobot, folder: Path) -> ExportedPredict
         one_percent = np.linalg.norm(measured) / 100.0
         exported = float(np.linalg.norm(measured - torque) / one_percent)
         identified = float(np.linalg.norm(measured - motion["predicted"]) / one_percent)
+        if score is not None:
+            exported, identified = score.without_floor(exported), score.without_floor(identified)
         if worst is None or exported > worst.exported:
             worst = ExportedPrediction(str(path.relative_to(folder)), exported, identified)
     return worst
@@ -313,8 +317,8 @@ def _link_bodies(robot: IdentifiedRobot, tree: UrdfTree, chain: Chain) -> tuple[
             loose_mass = sum(float(body[9]) for body in bodies if body is not None)
             raise RobotError(
                 f"{tree.where}: {total[9]:.3g} kg were identified between {joint.name} and the arm's next joint, and "
-                f"the file hangs {loose_mass:.3g} kg on link '{joint.child}' by joints that are not the arm's "
-                f"({listing(loose, 3)}): no possible body remains for the link. Either the motion does not identify "
+                f"the file attaches {loose_mass:.3g} kg to link '{joint.child}' by joints that are not the arm's "
+                f"({listing(loose, 3)}): no physically consistent body remains. Either the motion does not identify "
                 "that joint's mass (estimate.csv: its sigma), or the drive gains or the masses of those links are "
                 "wrong: correct these and identify again, or omit --urdf: then robot.urdf is the arm alone"
             )
@@ -360,7 +364,8 @@ def _check(robot: IdentifiedRobot, source: str, chain: Chain, where: str, mjcf: 
         difference = float(np.abs(frames - moving_frames(robot.chain, q)).max())
         if difference > MAX_DIFFERENCE:
             raise RobotError(
-                f"{where}: poses differ by {difference:.2g} when Pinocchio reads the file; nothing was written"
+                f"{where}: poses differ by {difference:.2g} when Pinocchio reads the file; nothing was written: "
+                "report this as a bug"
             )
     share = float(np.abs(torques - expected).max()) / max(1.0, float(np.abs(expected).max()))
     if share > MAX_DIFFERENCE:
@@ -370,7 +375,7 @@ def _check(robot: IdentifiedRobot, source: str, chain: Chain, where: str, mjcf: 
         )
     for quantity, values, column in (("damping", damping, 1), ("friction", friction, 2)):
         if not np.allclose(values, robot.drives.values[:, column], rtol=MAX_DIFFERENCE, atol=1e-12):
-            raise RobotError(f"{where}: Pinocchio reads another {quantity} than was written")
+            raise RobotError(f"{where}: Pinocchio reads another {quantity} than was written: report this as a bug")
 
 
 def without_left(dynamics: Dynamics) -> Dynamics:

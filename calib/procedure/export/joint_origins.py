@@ -61,7 +61,7 @@ def joint_origins(source: str, edited: str, where: str) -> str:
             continue
         turn = Rotation.from_matrix(joint.origin[:3, :3]).as_quat()
         if np.abs(Rotation.from_quat(turn).as_matrix() - joint.origin[:3, :3]).max() > max_difference:
-            refuse_robot(where, f"the rotation part of joint '{name}' is not a rotation matrix")
+            refuse_robot(where, f"the rotation part of joint '{name}' is not a rotation matrix: correct its origin")
         moved[name] = {
             "position": dict(zip("xyz", joint.origin[:3, 3].tolist())),
             "orientation": dict(zip("xyzw", turn.tolist())),

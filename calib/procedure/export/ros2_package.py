@@ -83,7 +83,7 @@ def write_package(
         notes.append("<ros2_control> is for mock hardware: name your robot's plugin in it")
     check_readback(content, str(target), chain)
     if lost:
-        notes.append(f"{len(lost)} meshes were not found and stay as they are written, as {lost[0]}")
+        notes.append(f"{len(lost)} meshes were not found; their file names are unchanged, such as {lost[0]}")
     needed = dict.fromkeys([*SHOWS, *(match[1] for each in lost if (match := _PACKAGE.match(each)))])
     made: dict[str, str | bytes] = {f"urdf/{robot}.urdf": content.encode(encoding)}
     made |= {place: file.read_bytes() for place, file in {**meshes, **configs}.items()}

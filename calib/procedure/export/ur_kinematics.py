@@ -93,7 +93,7 @@ def _inertia_frame(nominal: Chain, urdf: Path | None, up: np.ndarray, ahead: np.
                 return pose
     level = ahead - up * (up @ ahead)
     if np.linalg.norm(level) < ON_AXIS:
-        raise RobotError("axis 3 stands over axis 2 at q = 0, where a UR is stretched")
+        raise RobotError("axis 3 lies above axis 2 at q = 0, where a UR is stretched")
     x = -level / np.linalg.norm(level)
     turned = pose_of(np.stack([x, np.cross(up, x), up], axis=1))
     rounded = np.round(turned)

@@ -168,7 +168,9 @@ class ValidationFolder:
 def _read(kind: type[T], path: Path) -> T:
     content = read_json(path, "fit again")
     if content.get("schema", 1) > SCHEMA:
-        raise UsageError(f"{path}: schema {content['schema']} of a later version, this one reads up to {SCHEMA}")
+        raise UsageError(
+            f"{path}: schema {content['schema']} is of a later version, this one reads up to {SCHEMA}: upgrade"
+        )
     if content.get("findings"):
         content["findings"] = _current_form(content["findings"])
     with refused_as(UsageError, ValueError, f"{path} cannot be read ({{}}); fit again"):

@@ -393,7 +393,7 @@ def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeas
     order = np.random.default_rng(seed).permutation(count)
     if held_count == 0 or held_count == count:
         raise MeasurementError(
-            f"a hold-out share of {share:g} gives {held_count} of {count} poses; change it", block.file
+            f"a hold-out share of {share:g} gives {held_count} of {count} poses; state another share", block.file
         )
     held_out = np.isin(pose, order[count - held_count :])
     return take(block, np.flatnonzero(~held_out)), take(block, np.flatnonzero(held_out))
@@ -499,6 +499,7 @@ def _with_frames_of_fit(block: PoseMeasurements, fit: Sequence[PoseMeasurements]
     if len(block.tool_names) != len(fit[0].tool_names):
         tools = ", ".join(block.tool_names)
         raise UsageError(
-            f"{block.file}: the fit has no tool {tools}, only {', '.join(sorted(fit_tools))}; refit_frames"
+            f"{block.file}: the fit has no tool {tools}, only {', '.join(sorted(fit_tools))}; refit its frames "
+            "(--refit-frames)"
         )
     return replace(block, tool_names=fit[0].tool_names)

@@ -117,7 +117,7 @@ class Chosen:
         """Return lines of text on the checked constraints, the unchecked constraints, and the run."""
         lines = []
         if self.checked:
-            lines.append(f"kept: {', '.join(self.checked)}")
+            lines.append(f"respected: {', '.join(self.checked)}")
         if self.unchecked:
             lines.append(f"NOT checked: {', '.join(self.unchecked)}")
         return lines + run_lines(self.run, self.driven)

@@ -35,7 +35,7 @@ DISPLACEMENT = 2e-5
 TURN = 2e-5
 ASSUMED = (
     f"predicted σ: for corner noise of {CORNER:g} px and a repeatability of {1e3 * DISPLACEMENT:g} mm and "
-    f"{1e3 * TURN:g} mrad per axis; unmodelled effects come on top"
+    f"{1e3 * TURN:g} mrad per axis; unmodelled effects are not included"
 )
 # times that views are drawn
 TRIES = 60
@@ -262,7 +262,7 @@ def camera_view(table: CameraTable, chain: Chain, where: str, folder: Path) -> C
         UsageError, MeasurementError, RobotError: for a missing file or an invalid placement.
     """
     for name in (table.lens, table.board):
-        require((folder / name).is_file(), f"{where}: camera: no file '{name}' next to it", UsageError)
+        require((folder / name).is_file(), f"{where}: camera: no file '{name}' next to it: copy it there", UsageError)
     if not table.range[0] < table.range[1]:
         raise UsageError(f"{where}: camera.range: {table.range[0]:g} is not below {table.range[1]:g}")
     lens = read_lens(folder / table.lens)

@@ -122,7 +122,7 @@ class TargetTable:
 
     def __post_init__(self) -> None:
         if not self.facing or not all(map(np.any, self.facing)):
-            raise ValueError("facing: [0, 0, 0] is not a direction")
+            raise ValueError("facing: [0, 0, 0] is not a direction; state one such as [0, 0, 1]")
         if isinstance(self.height, tuple):
             rising(self.height, "height")
 

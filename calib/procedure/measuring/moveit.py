@@ -61,7 +61,9 @@ def moveit_files(path: Path) -> list[Path]:
     if len(srdf) > 1:
         raise UsageError(f"{path} has {len(srdf)} SRDF files: give one of them, as {srdf[0]}")
     if not limits and not srdf:
-        raise UsageError(f"{path}: neither {JOINT_LIMITS} nor *{SRDF} in this folder or its config")
+        raise UsageError(
+            f"{path}: neither {JOINT_LIMITS} nor *{SRDF} in this folder or its config folder: give the MoveIt package"
+        )
     return [*limits[:1], *srdf]
 
 
@@ -117,7 +119,11 @@ def _limits(path: Path, chain: Chain, source: Path | None) -> ParsedTable:
         if upper is None:
             upper = joint.upper
         tables.setdefault("joints", {})[joint.name] = [lower, upper]
-    require(tables, f"{path}: limits no joint of the arm ({', '.join(chain.joint_names)})", UsageError)
+    require(
+        tables,
+        f"{path}: limits no joint of the arm ({', '.join(chain.joint_names)}): is it for another robot?",
+        UsageError,
+    )
     return tables
 
 
@@ -163,7 +169,7 @@ def _pairs(path: Path, chain: Chain, source: Path | None) -> ParsedTable:
     ignored = [list(pair) for pair in pairs if {*pair} <= links]
     if pairs and not ignored:
         raise UsageError(
-            f"{path}: none of its {len(pairs)} disabled pairs is of links of {chain.name}, as {shown(pairs[:1])}: "
-            "is it another robot's?"
+            f"{path}: none of its {len(pairs)} disabled pairs has links of {chain.name}, e.g. {shown(pairs[:1])}: "
+            "is it for another robot?"
         )
     return {"ignored": ignored}

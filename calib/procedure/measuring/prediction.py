@@ -60,7 +60,7 @@ class SelectionPrediction:
             selection_joints = ", ".join(self.joints)
             raise UsageError(
                 f"the selection belongs to another robot: its joints are {selection_joints}; "
-                f"this robot has {', '.join(joints)}"
+                f"this robot has {', '.join(joints)}: choose poses for it"
             )
 
 
@@ -167,7 +167,7 @@ def table(prediction: Prediction, by_pose_count: tuple[Prediction, ...]) -> list
     label = "predicted σ of the tool's position"
     if not np.isfinite(prediction.rms):
         return [(label, "not available: these poses do not identify all parameters")]
-    rows = [(label, f"{1e3 * prediction.rms:.3g} mm rms, {1e3 * prediction.worst:.3g} mm at 95 %")]
+    rows = [(label, f"{1e3 * prediction.rms:.3g} mm rms, {1e3 * prediction.worst:.3g} mm at 95 %, by noise alone")]
     sigmas = []
     for unit, quantity, printed_unit in QUANTITIES:
         indices = [k for k, parameter_unit in enumerate(prediction.units) if parameter_unit == unit]

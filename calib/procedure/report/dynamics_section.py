@@ -134,7 +134,7 @@ def read_lines(inputs: IdentificationInputs) -> list[str]:
     if isinstance(chain, Chain):
         geometry = "calibrated" if inputs.robot.moved else "nominal geometry"
         lines = [f"robot {chain.name}: {chain.n} joints, {chain.base} to {chain.tip}, {geometry}"]
-    lines += [_recording_line(case, "to learn from") for case in inputs.cases]
+    lines += [_recording_line(case, "for training") for case in inputs.cases]
     lines += [_recording_line(case, "unseen") for case in inputs.unseen]
     lines += [f"  {page.single_colons(note)}" for note in inputs.notes]
     return lines
@@ -218,7 +218,7 @@ def report_section(
 
 def _parameter_table(estimate: Sequence[IdentifiedParameter]) -> page.ReportTable:
     """Return the table of identified parameters with value, σ and relative standard deviation."""
-    header = ("parameter", "unit", "value", "σ", "RSD", "what it holds")
+    header = ("parameter", "unit", "value", "σ", "RSD", "contents")
     rows = []
     for parameter in estimate:
         sigma = "" if parameter.sigma is None else f"{parameter.sigma:.2g}"
@@ -277,6 +277,8 @@ def _key_figures(unseen: UnseenReport, tolerance: float, delivered: float | None
     error, in_band = "torque unexplained", "torque unexplained in the motion's band"
     if proof.stands:
         error += " in motion"
+    if proof.noisy:
+        error += f" below {proof.band:.3g} Hz"
     identified = percent(proof.judged.total)
     allowed = f"{tolerance:g} %" if tolerance else "none"
     if delivered is None:
@@ -291,6 +293,8 @@ def _key_figures(unseen: UnseenReport, tolerance: float, delivered: float | None
         ]
     if proof.stands:
         figures.append(page.KeyFigure("torque unexplained at rest", "", percent(proof.standing.total), "", basis))
+    if proof.noisy:
+        figures.append(page.KeyFigure("torque unexplained at all frequencies", "", percent(proof.raw.total), "", basis))
     figures.append(page.KeyFigure(in_band, "", percent(proof.filtered.total), "", basis))
 
     finite = [(share, row) for share, row in zip(proof.filtered.joints, unseen.rows) if np.isfinite(share)]
@@ -354,7 +358,7 @@ def _reference_table(unseen: UnseenReport) -> page.ReportTable:
     for recording, references in unseen.references.items():
         errors = references.nominal, references.plain, references.delivered
         rows.append([recording, *map(percent, errors)])
-    title = "Beside plain references: torque unexplained on held-out motion"
+    title = "Comparison with plain references: torque unexplained on held-out motion"
     return page.ReportTable(title, header, rows, REFERENCE_NOTE, numbers=[1, 2, 3])
 
 

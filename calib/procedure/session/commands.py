@@ -65,7 +65,7 @@ def asks(session: Session, state: State) -> tuple[str, str]:
         task, file = _to_measure(session, step)
     else:
         return f"step {step} needs {state.words}", f"put it into {session.folder} and run {next_command} again"
-    return task, f"Bring {file}; then: {next_command}"
+    return task, f"Provide {file}; then: {next_command}"
 
 
 def _to_measure(session: Session, step: str) -> tuple[str, str]:

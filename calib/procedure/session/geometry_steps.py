@@ -6,7 +6,7 @@ A session selects two sets of poses: optimised poses for the fit, and random pos
 import shutil
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -40,7 +40,7 @@ from calib.procedure.kinematic_stage import fit as fitting
 from calib.procedure.kinematic_stage import folder as outputs
 from calib.procedure.kinematic_stage import inputs, selection
 from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
-from calib.procedure.kinematic_stage.validation import assess
+from calib.procedure.kinematic_stage.validation import Assessment, assess
 from calib.procedure.measuring.constraints_file import VIEW_UNCHECKED
 from calib.procedure.measuring.measuring_run import same_turn, write_run
 from calib.procedure.measuring.pose_limits import read_limits
@@ -52,6 +52,7 @@ from calib.procedure.report.geometry_section import error_words, outlier_sentenc
 from calib.procedure.report.outputs import write_fit
 from calib.procedure.session import drift, folder
 from calib.procedure.session.folder import Say, Session
+from calib.records import read_json
 from calib.robot import calibrated
 from calib.robot.chain import Chain, joint_kinds
 from calib.robot.formats.urdf_tree import is_urdf
@@ -424,7 +425,32 @@ def validate(session: Session, say: Say) -> list[Note]:
     validation_metrics = session.validation.write(assessment, gathered, rows)
     fit_report.write(report.with_unseen(validation_metrics, rows), session.validation.report)
     new_warnings = [warning for warning in assessment.warnings if warning not in metrics.warnings]
+    notes += notes_of(_predicted_and_reached(session, assessment))
     return [*notes, Note(str(assessment.verdict)), *as_notes(new_warnings, assessment.noticed)]
+
+
+def _predicted_and_reached(session: Session, assessment: Assessment) -> list[Finding]:
+    """Return the findings that state the accuracy of the tool reached on held-out poses next to the predicted one."""
+    path = session.path(folder.SELECTION)
+    if not session.settings.poses.plan or not path.exists():
+        return []
+    predicted = read_json(path, "repeat the step with `calib redo`", _PredictedTool).tool_sigma
+    if predicted is None:
+        return []
+    findings = []
+    for name, rows in assessment.validation.items():
+        delivered = rows.of_urdf if assessment.deliverable == "urdf" else rows
+        if rows.proves:
+            reached = delivered.errors[1].rms
+            findings.append(finding("tool-accuracy-reached", file=name, reached=reached, predicted=predicted))
+    return findings
+
+
+@dataclass(frozen=True)
+class _PredictedTool:
+    """The key of ``selection.json`` with the predicted σ of the tool's position [m]; None if it is not known."""
+
+    tool_sigma: float | None = None
 
 
 def export(session: Session, say: Say) -> list[str]:

@@ -179,7 +179,7 @@ def with_answer(answers: Answers, question: Question, text: str) -> Answers:
             value = {"y": True, "n": False}.get(text[:1].lower(), text)
     result = replace(answers, **{name: getattr(parse(Answers, {name: value}, ""), name)})
     if name == "robot":
-        require(text, "a robot is needed", UsageError)
+        require(text, "a robot is needed: a file, or a robot of the library", UsageError)
         resolve(text)
     # what is not answered yet is no error
     checked(replace(result, robot=result.robot or "", instrument=result.instrument or "tracker"))
@@ -193,11 +193,17 @@ def checked(answers: Answers) -> FieldValues:
         UsageError: for an invalid answer.
     """
     robot, instrument = answers.robot, answers.instrument
-    require(robot is not None and instrument is not None, "a robot and an instrument are needed", UsageError)
+    require(
+        robot is not None and instrument is not None,
+        "a robot and an instrument are needed: give --robot and --instrument",
+        UsageError,
+    )
     instrument_named(instrument or "")
     of_camera = [name for name in CAMERA if getattr(answers, name) is not None]
     if of_camera and _measures(answers) != IMAGES:
-        raise CalibError(f"--{of_camera[0]} applies to a camera that takes images; the instrument is {instrument}")
+        raise CalibError(
+            f"--{of_camera[0]} applies to a camera that takes images; the instrument is {instrument}: leave it out"
+        )
     dynamics = answers.dynamics is not False
     for goal in answers.goals:
         checked_goal(goal)
@@ -314,7 +320,7 @@ def cell_tables(**answers: str | Sequence[str] | None) -> dict[str, object]:
             value = read(text, texts) if name in ("carried", "stands") else read(text)
         except ValueError as error:
             option = "obstacle" if name == "obstacles" else name.replace("_", "-")
-            raise UsageError(f"--{option} {text}: {error}, or unknown") from None
+            raise UsageError(f"--{option} {text}: {error}, or the word unknown") from None
         if key:
             tables[table] = tables.get(table, {}) | {key: value}
         else:

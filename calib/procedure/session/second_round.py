@@ -172,7 +172,7 @@ def _unmodelled(inputs: ExcitationInputs, joints: list[_ShortParameter]) -> list
     if not joints:
         return []
     names = listing(f"{inputs.chain.joint_names[joint.joint]} {joint.error:.2g} %" for joint in joints)
-    return [f"more motion does not help {names}: what is left is not modelled (friction, elasticity)"]
+    return [f"more motion does not reduce the torque errors of {names}: they are unmodelled effects"]
 
 
 def _gains(designed: design.Designed, joints: list[_ShortParameter], parameters: tuple[str, ...]) -> list[str]:
@@ -198,7 +198,7 @@ def _gains(designed: design.Designed, joints: list[_ShortParameter], parameters:
         if row.name in parameters and row.value and row.sigma_before and row.rsd is not None:
             before = 100.0 * row.sigma_before / abs(row.value)
             parts.append(f"σ of {row.name} from {before:.2g} to {row.rsd:.2g} %")
-    return [f"{seconds:.0f} s more, of a motion designed for it, bring the {listing(parts, 6)}"]
+    return [f"a further motion of {seconds:.0f} s, designed for this, is expected to change {listing(parts, 6)}"]
 
 
 def promised(session: Session) -> tuple[str, ...]:
@@ -216,7 +216,7 @@ def promised(session: Session) -> tuple[str, ...]:
     played = folder / SAMPLES
     if session.settings.dynamics.repeats > 1:
         played = folder / RUN
-    task = f"play {played}, bring its log as {session.path(f'7-recorded/{name}_log.csv')}; then: "
+    task = f"play {played}, put its log into {session.path(f'7-recorded/{name}_log.csv')}; then: "
     return (notes[0], f"if wanted, {task}{command_line('next', session.folder)}")
 
 

@@ -234,8 +234,8 @@ class DynamicsSection:
         _check_labels(self.payloads)
         if self.repeats > MAX_SAMPLES / max(self.period * self.rate, 1e-300):  # a quotient: repeats may be huge
             raise ValueError(
-                f"period {self.period:g} s at rate {self.rate:g} Hz, repeated {self.repeats} times: more than "
-                f"{MAX_SAMPLES:.0e} samples"
+                f"period {self.period:g} s at rate {self.rate:g} Hz, repeated {self.repeats} times, is more than "
+                f"{MAX_SAMPLES:.0e} samples: lower one of them"
             )
 
 

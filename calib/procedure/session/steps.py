@@ -490,7 +490,7 @@ def changed_inputs(before: Mapping[str, str], after: Mapping[str, str]) -> str:
             parts.append(f"{name} is new")
         if name in before and _comparable(name, before[name]) != _comparable(name, mark):
             parts.append(f"{name} has changed")
-    parts += [f"{name} is gone" for name in sorted(before.keys() - after)]
+    parts += [f"{name} was removed" for name in sorted(before.keys() - after)]
     return ", ".join(parts)
 
 

@@ -120,7 +120,7 @@ class ChangePart(ABC):
         reached = met(self.today, self.tolerance or 0.0)
         figure = KeyFigure(self.error_words, "", self.shown(self.today), "", self.basis, allowed, reached)
 
-        title = "Changed parameters, those first that explain most"
+        title = "Changed parameters, in the order of how much of the change they explain"
         compared = [parameter for parameter in self.change.parameters if parameter.sigma or parameter.explained]
         parameters = table(title, _PARAMETERS, compared[:MAX_PARAMETERS], f"All in {self.table}.")
         blocks = [*self.blocks(), parameters]

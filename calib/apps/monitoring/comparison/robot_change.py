@@ -197,7 +197,7 @@ def _torque_parts(before: Place, after: Place, settings: DiffSettings) -> list[C
         states = read_states(Path(name), later.model.n)
         require(states, f"{name}: no accelerations; expected columns q_…, v_… and a_…", UsageError)
         motions[name] = states  # type: ignore[assignment]
-    message = f"neither {earlier.name} nor {later.name} holds a motion without payload; give one with --motion"
+    message = f"neither {earlier.name} nor {later.name} contains a motion without payload; give one with --motion"
     require(motions, message, UsageError)
     change = torque_change.compare(earlier, later, motions)
     tolerance = settings.torque_tolerance or later.tolerance or earlier.tolerance or None

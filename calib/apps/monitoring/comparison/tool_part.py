@@ -42,7 +42,7 @@ class ToolPart(ChangePart):
     @property
     def words(self) -> str:
         motion = self.change.motions[0]
-        return f"the tool moved by {1e3 * motion.rms:.3g} mm rms (σ lets expect {1e3 * motion.expected:.2g} mm)"
+        return f"the tool moved by {1e3 * motion.rms:.3g} mm rms (expected from σ: {1e3 * motion.expected:.2g} mm)"
 
     @property
     def basis(self) -> str:
@@ -103,7 +103,7 @@ class ToolPart(ChangePart):
             RecordColumn("poses", _pose_count),
             RecordColumn("median mm", _median_mm),
             RecordColumn("rms mm", _rms_mm),
-            RecordColumn("σ of that mm", _expected_mm),
+            RecordColumn("expected from σ mm", _expected_mm),
             RecordColumn("worst mm", _worst_mm),
             RecordColumn("median mrad", _median_mrad),
             RecordColumn("worst mrad", _worst_mrad),
@@ -116,7 +116,7 @@ class ToolPart(ChangePart):
         return [
             Text("Motion", self._motion()),
             table("Motion of the tool", motions, self.change.motions),
-            table("Motion of the tool by what describes one joint", by_joint, self.change.by_joint),
+            table("Motion of the tool that the parameters of one joint explain", by_joint, self.change.by_joint),
         ]
 
     def _motion(self) -> list[str]:
@@ -130,7 +130,7 @@ class ToolPart(ChangePart):
             lines.append(f"{beginning}, {worst}, {turns}")
         if change.changed:
             joint, joint_rms = max(change.by_joint, key=itemgetter(1))
-            lines.append(f"most of it comes from {joint}: {1e3 * joint_rms:.3g} mm rms")
+            lines.append(f"most of this motion comes from {joint}: {1e3 * joint_rms:.3g} mm rms")
         return lines
 
     def _worst_joints(self, motion: ToolMotion) -> str:

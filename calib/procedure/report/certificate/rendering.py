@@ -115,7 +115,7 @@ def _typeset(inputs: Mapping[str, bytes], dense: bool) -> tuple[bytes, list[str]
             lacking = re.search('the text `"(.*)"` could not be displayed', str(error))
             if lacking is None or not standard:
                 raise
-            notes = [f"{PAGES[1]}: no font here has {lacking[1]!r}: a box stands for it; {PAGES[0]} shows it"]
+            notes = [f"{PAGES[1]}: no font here has {lacking[1]!r}: a box replaces it; {PAGES[0]} shows it"]
     raise AssertionError("without a standard every letter is accepted")
 
 
