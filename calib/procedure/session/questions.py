@@ -228,7 +228,7 @@ def checked(answers: Answers) -> FieldValues:
         if answers.cell:
             first = next(iter(answers.cell))
             option = first.replace("_", "-").replace("obstacles", "obstacle")
-            raise UsageError(f"--{option} and --limits both describe the cell; put it into {answers.limits}")
+            raise UsageError(f"--{option} and --limits both describe the cell; state it in {answers.limits} only")
 
     optional = {
         "payloads": stated_payloads(answers.payloads),
