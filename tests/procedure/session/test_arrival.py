@@ -110,6 +110,6 @@ def test_unknown_program_is_refused_when_typed() -> None:
     """The question is asked again at once, so that no answer is lost at the end."""
     ask = {question.name: question for question in QUESTIONS}
     answers = with_answer(Answers(), ask["robot"], "lwr4plus")
-    with pytest.raises(UsageError, match="'0.5' is not one of"):
+    with pytest.raises(UsageError, match=r"'0\.5' is not one of"):
         with_answer(answers, ask["program"], "0.5")
     assert with_answer(answers, ask["program"], "none").program == "none"
