@@ -10,8 +10,7 @@ from typing import Annotated
 from unicodedata import category
 
 from calib.config import strict
-from calib.config_types import Checked, Expect, OneOf, Real, Text, Typed
-from calib.procedure.excitation.settings import Front, Goal, Period
+from calib.config_types import Checked, Expect, OneOf, Real, Text, Typed, Whole
 
 CAMERA = ("mounting", "lens", "board", "carried", "stands")
 CELL = ("instrument_at", "cone", "facing", "box", "obstacles", *CAMERA)
@@ -25,7 +24,10 @@ MAX_LETTERS = 200
 def _entry(value: object) -> object:
     """Return an entry of a certificate (text, number or date) as one line of printable text.
 
-    Other values are returned unchanged.
+    Values of other types are returned unchanged.
+
+    Args:
+        value: the entry.
 
     Raises:
         ValueError: for a text that is too long.
@@ -112,6 +114,8 @@ class Answers:
         front: number of trade-offs between condition number and torque goal to choose from; 0: none.
         tolerance_mm: largest accepted rms of the position on unseen poses [mm]; 0: none.
         tolerance_percent: largest accepted torque error of the exported robot on unseen motion [%]; 0: none.
+        tolerance_torque: largest accepted rms torque error of each joint on unseen motion [N m or N]: one number for
+            all joints, or one per joint with commas (0: none); none.
         program: controller in whose language the poses are written, too: ur, krl … (calib program --list); or none.
         details: ask for the certificate's details: number, serial numbers, operator ….
         certificate: these details.
@@ -134,11 +138,12 @@ class Answers:
     dynamics: Annotated[bool, Typed("--dynamics/--geometry-only")] | None = None
     torques: Torques | None = None
     payloads: tuple[str, ...] = ()
-    goals: tuple[Goal, ...] = ()
-    period: Period | None = None
-    front: Front | None = None
+    goals: tuple[str, ...] = ()
+    period: Annotated[float, Real(above=0.0, most=3600.0, unit="s")] | None = None
+    front: Annotated[int, Whole(0, 1000)] | None = None
     tolerance_mm: Tolerance | None = None
     tolerance_percent: Tolerance | None = None
+    tolerance_torque: Text | None = None
     program: Text | None = None
     details: Annotated[bool, Typed("--details/--no-details")] | None = None
     certificate: CertificateSection = field(default_factory=CertificateSection)

@@ -363,7 +363,7 @@ def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], where
     """Return the coal shape of a <geometry> node; for an unreadable mesh None, and its name is added to `missing`."""
     kind = node.children[0] if node is not None and node.children else None
     if kind is None:
-        refuse_robot(where, "<collision> without a shape")
+        refuse_robot(where, "<collision> without a shape: add a <geometry>")
     if kind.tag == "mesh":
         return _hull(kind, folders, missing, where)
     if kind.tag == "box":

@@ -16,7 +16,7 @@ from calib.identification.gains import GainRecord
 from calib.identification.identify import Identification
 from calib.identification.model_file import MODEL, read_dynamics, to_table
 from calib.identification.physical_consistency import information
-from calib.identification.prediction import Dynamics, predict
+from calib.identification.prediction import Dynamics, Score, predict
 from calib.identification.rows import Case
 from calib.identification.uncertainty.torque_errors import TorqueErrorModel, read_uncertainty
 from calib.procedure.dynamic_stage import geometry_tables
@@ -90,7 +90,16 @@ class IdentificationFolder:
 
         Without held-out motion: the table of the first training recording.
         """
-        return sorted(self.unseen.path.glob("torques_*.csv")) or [self.path / "torques_1.csv"]
+        paths = self.unseen.path.glob("torques_*.csv")
+        return sorted(paths, key=_number_of_table) or [self.path / "torques_1.csv"]
+
+    def scores_of_torques(self) -> Sequence[Score | None]:
+        """Read the scores of the model on the recordings of the tables `torques`; None if they are not stored."""
+        if not (self.unseen.report.is_file() or (self.path / folders.REPORT).is_file()):
+            return [None] * len(self.torques)
+        report = self.judged
+        scores = {**report.fit, **report.validation}
+        return [scores[curves.name] for curves in report.curves]
 
     @property
     def unseen(self) -> UnseenFolder:
@@ -101,7 +110,7 @@ class IdentificationFolder:
     def judged(self) -> UnseenReport:
         """Report of the model's errors on held-out motion.
 
-        The session's report if there is one, otherwise the report that `calib identify` wrote.
+        It is the session's report if there is one, otherwise the report that `calib identify` wrote.
         """
         return (self.unseen if self.unseen.report.is_file() else UnseenFolder(self.path)).read()
 
@@ -133,6 +142,11 @@ class IdentificationFolder:
         return TorqueErrorModel(uncertainty.columns, uncertainty.covariance, discrepancy)
 
 
+def _number_of_table(path: Path) -> int:
+    """Return the number in the file name of a table of torques, such as 12 for ``torques_12.csv``."""
+    return int(path.stem.rpartition("_")[2])
+
+
 @dataclass(frozen=True)
 class UnseenFolder:
     """Folder with an identified model's validation on held-out motion."""
@@ -142,7 +156,12 @@ class UnseenFolder:
     report = folders.InFolder(folders.REPORT)  # scores, verdict, and curves for the certificate
 
     def write(self, inputs: IdentificationInputs, assessment: DynamicsAssessment) -> None:
-        """Write one table of torques for each held-out recording, and the report on the model's errors."""
+        """Write one table of torques for each held-out recording, and the report on the model's errors.
+
+        Args:
+            inputs: robot, recordings and options.
+            assessment: the model's predictions and errors on the held-out recordings, and the verdict.
+        """
         nominal = geometry_tables.on_nominal_geometry(self.path.parent)
         for number, case in enumerate(inputs.unseen, 1):
             _write_torques(inputs, case, assessment, nominal, self.path / f"torques_{number}.csv")
@@ -196,7 +215,12 @@ def write_folder(
 
 
 def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
-    """Write all files of an identification into a folder, except figures and report pages."""
+    """Write all files of an identification into a folder, except figures and report pages.
+
+    Args:
+        outcome: the identification with its errors and verdict.
+        folder: the folder.
+    """
     inputs, identification = outcome.inputs, outcome.found
     robot = inputs.robot
     if isinstance(robot, Mechanism):
@@ -278,10 +302,12 @@ def _write_torques(
 def read_torques(path: Path) -> dict[str, np.ndarray]:
     """Read a table of torques written for a recording without a payload.
 
+    Args:
+        path: the CSV file.
+
     Returns:
         Arrays by name: measured and predicted torques (N, rows), and joint positions q, velocities v and accelerations
-            a
-        (N, n); empty if the table has no velocities and accelerations.
+        a (N, n); empty if the table has no velocities and accelerations.
     """
     table = read_table(path)
     blocks = {}
@@ -298,6 +324,9 @@ def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[object, ...]]:
     The σ of a parameter is its total σ, from torque noise and geometry; the relative standard deviation (RSD) is in
     percent. The σ from the geometry is NaN if the geometry is taken as exact. Friction terms that were switched off,
     and parameters fixed by a constraint, have no σ (NaN), because they were not estimated from the measurement.
+
+    Args:
+        outcome: the identification with its errors and verdict.
     """
     identification, carried = outcome.found, outcome.carried
     estimate = identification.fitted.estimate
@@ -335,6 +364,11 @@ def _expressions(identification: Identification, unmeasured: Sequence[str], boun
     """Return for each parameter a text that explains it.
 
     The text is a combination of standard parameters, or the name of a drive term's shape (such as a friction term).
+
+    Args:
+        identification: the identification.
+        unmeasured: names of the drive terms that were switched off since nothing was measured for them.
+        bound: names of the parameters that a constraint fixes at its bound.
     """
     lines = [line.split(" = ", 1)[1] for line in expressions(identification.base)]
     for term in identification.friction.terms:

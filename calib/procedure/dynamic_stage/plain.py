@@ -53,6 +53,9 @@ def plain_values(identification: Identification[RegressorModel]) -> np.ndarray:
     """Return the parameters (p,) of the identified model, estimated by plain weighted least squares.
 
     Terms beyond the standard model are zero. A payload that no training recording carries keeps its known parameters.
+
+    Args:
+        identification: the identification with its recordings.
     """
     base, dynamics = identification.base, identification.dynamics
     torque_rows = identification.rows[0].target.shape[1]
@@ -75,8 +78,8 @@ def truncated(data: Triangles) -> np.ndarray:
     """Return the weighted least-squares values (p,) of minimum norm, truncated at the data's rank.
 
     Args:
-        data: R factors of the rows, one group per torque row; each group is weighted by the inverse rms of its
-            residuals.
+        data: triangular factors R of the regression's rows (Rᵀ R: normal equations), one group per torque row; each
+            group is weighted by the inverse rms of its residuals.
     """
     weight, values = np.ones(data.groups), np.zeros(data.parameters)
     for _ in range(ROUNDS):
@@ -95,6 +98,10 @@ def nominal_values(chain: Chain, dynamics: Dynamics[RegressorModel]) -> np.ndarr
     """Return the model's parameters (p,) from the masses of the robot's description, without friction.
 
     None if the description states no masses, or if the torque rows contain no rigid-body torques.
+
+    Args:
+        chain: the arm with the masses and inertias of its description.
+        dynamics: the identified model, which determines the parameters and their order.
     """
     inertias = getattr(chain, "inertias", None)
     if inertias is None or not np.any(inertias[:, 9] > 0.0) or not dynamics.model.torque_rows.has_bodies:
@@ -132,36 +139,48 @@ def references(
             error = np.nan
             if values is not None and len(values) == len(dynamics.values):
                 predicted = predict(Dynamics(dynamics.model, values), case)
-                error = _unexplained(case, predicted, score.stands, slow, apart)
+                error = _unexplained(case, predicted, score, slow, apart)
             errors.append(error)
         result[case.name] = PlainReferences(score.judged.total, *errors)
     return result
 
 
 def _unexplained(
-    case: Case, predicted: np.ndarray, in_motion: bool, slow: float | tuple[float, ...] | None, apart: Sequence[int]
+    case: Case, predicted: np.ndarray, score: Score, slow: float | tuple[float, ...] | None, apart: Sequence[int]
 ) -> float:
     """Return the unexplained share 100 ‖τ - τ̂‖ / ‖τ‖ [%] of the torques τ of a recording; NaN without torques.
 
-    With `in_motion`, only samples at which the joint moves are counted.
+    Samples and frequencies are those that count in the model's score, see `Score.judged`.
+
+    Args:
+        case: the recording with N samples.
+        predicted: (N, rows) predicted torques.
+        score: the model's score on the recording, which states whether noise or standing joints are excluded.
+        slow: speed below which a joint counts as standing; None: default speed.
+        apart: indices of rows that have another unit and are not counted.
     """
     motion = case.motion
     rows = case.target.shape[1]
+    target = case.target
+    if score.noisy:
+        target, predicted = motion.in_band(target), motion.in_band(predicted)
     counted = np.repeat(motion.weight[:, None] > 0.5, rows, axis=1)
-    if in_motion:
+    if score.stands:
         moves = moving(motion) if slow is None else moving(motion, slow)
         counted &= moves[:, np.arange(rows) % motion.n]
     counted[:, list(apart)] = False
-    residual_squares = float(np.sum((case.target - predicted)[counted] ** 2))
-    squares = float(np.sum(case.target[counted] ** 2))
+    residual_squares = float(np.sum((target - predicted)[counted] ** 2))
+    squares = float(np.sum(target[counted] ** 2))
     return 100.0 * float(np.sqrt(residual_squares / squares)) if squares > 0.0 else np.nan
 
 
 def worse_than_plain(errors_by_file: Mapping[str, PlainReferences]) -> list[Finding]:
-    """Return a finding on the held-out recording on which plain least squares is better than the model by the largest
-    factor.
+    """Return a finding on the held-out recording on which plain least squares is better by the largest factor.
 
-    An empty list if the factor is below the catalogue's limit on every recording.
+    An empty list if plain least squares is better than the model by less than the catalogue's limit on every recording.
+
+    Args:
+        errors_by_file: name of a recording -> errors of the model and of the plain references.
     """
     ratios = {}
     for name, errors in errors_by_file.items():

@@ -23,7 +23,10 @@ AIMS = ("logdet", "smallest", "torque", "parameters")
 
 
 def split_goal(text: str) -> tuple[str, float]:
-    """Return name and value of a goal such as ``wrist=0.1``.
+    """Return name and value of a goal.
+
+    Args:
+        text: the goal, such as ``wrist=0.1``.
 
     Raises:
         UsageError: for an unknown name, or a missing number.
@@ -38,14 +41,23 @@ def split_goal(text: str) -> tuple[str, float]:
     return name, value
 
 
-def _goal(text: object, aims: tuple[str, ...] = AIMS) -> object:
+def checked_goal(text: object, aims: tuple[str, ...] = AIMS) -> object:
+    """Return the text of a goal after checking its name and number; anything but a text is returned as it is.
+
+    Args:
+        text: the goal, such as ``wrist=0.1`` or ``logdet``.
+        aims: names of goals without a number.
+
+    Raises:
+        UsageError: for an unknown name, or a missing number.
+    """
     if isinstance(text, str) and text not in aims:
         split_goal(text)
     return text
 
 
-Goal = Annotated[str, Checked(_goal)]
-HardGoal = Annotated[str, Checked(lambda text: _goal(text, ()))]
+Goal = Annotated[str, Checked(checked_goal)]
+HardGoal = Annotated[str, Checked(lambda text: checked_goal(text, ()))]
 Rate = Annotated[float, Real(above=0.0, most=1e5, unit="Hz")]
 Period = Annotated[float, Real(above=0.0, most=3600.0, unit="s")]
 Front = Annotated[int, Whole(0, 1000)]
