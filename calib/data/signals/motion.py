@@ -53,6 +53,7 @@ ROWS = (
     "q_link",
     "q_ref",
     "tau_ff",
+    "q_measured",
     "v_measured",
 )
 
@@ -110,8 +111,8 @@ class Motion:
         velocity_cutoff: (n,) f_v [Hz], cut-off of the positions from which v is computed.
         decimator: the filter of the parallel decimation to `band`.
         joint_names, kind, file, drive_gain, effort_variance: those of the recording. tau_link, tau_motor, q_link,
-            q_ref, tau_ff, v_measured: (N, n) further series of the recording on the grid, not filtered; None where not
-            recorded.
+            q_ref, tau_ff, q_measured, v_measured: (N, n) further series of the recording on the grid, not filtered;
+            None where not recorded.
         sampling, cutoffs: reports of resampling and of the cut-offs; notes: remarks for the user; jumps, faults: those
             of the recording.
         located: time at which a designed motion, used as the reference, begins [s]; None for another reference.
@@ -140,6 +141,7 @@ class Motion:
     q_link: np.ndarray | None = None
     q_ref: np.ndarray | None = None
     tau_ff: np.ndarray | None = None
+    q_measured: np.ndarray | None = None
     v_measured: np.ndarray | None = None
     drive_gain: np.ndarray | None = None
     effort_variance: np.ndarray | None = None
@@ -237,8 +239,8 @@ def make_motion(
     rows = _span(mask)
     series: FieldValues = {}
     for name, values in sampled.series.items():
-        if name != "q":
-            series["v_measured" if name == "v" else name] = read_only(values[rows])
+        field = f"{name}_measured" if name in ("q", "v") else name
+        series[field] = read_only(values[rows])
     return Motion(
         t=read_only(sampled.t[rows]),
         q=read_only(q[rows]),

@@ -85,9 +85,15 @@ class Plant:
         factors = np.append(carried_columns, np.ones(len(self.terms)))
         return self.with_parameters(self.parameters * factors)
 
-    def run(self, controller: LoopController, reference: Reference, sensing: Sensing | None = None) -> SimulatedRun:
+    def run(
+        self,
+        controller: LoopController,
+        reference: Reference,
+        sensing: Sensing | None = None,
+        seed: int | np.random.Generator = 0,
+    ) -> SimulatedRun:
         """Return the simulated motion of the robot that follows a reference; see `simulate`."""
-        return simulate(self, controller, reference, sensing)
+        return simulate(self, controller, reference, sensing, seed)
 
     def feed_forward(self, reference: Reference) -> np.ndarray:
         """Return the torques (N, n) along a reference; see `feed_forward`."""

@@ -65,6 +65,7 @@ class IdentificationProblem:
         cad: standard parameters of the bodies from the robot's description, for a loop that feeds them forward.
         constraints: constraints of the options, for methods that support them; None: the defaults.
         start: (p,) start values of methods that simulate; None: least squares, where that can be simulated.
+        progress: called with a short text at each round of a method that simulates; None: not called.
     """
 
     model: RegressorModel
@@ -80,9 +81,15 @@ class IdentificationProblem:
     cad: np.ndarray | None = None
     constraints: ConstraintSettings | None = None
     start: np.ndarray | None = None
+    progress: Callable[[str], None] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "groups", frozen(self.groups, int))
+
+    def say(self, text: str) -> None:
+        """Call `progress`, if there is one, with a short text."""
+        if self.progress is not None:
+            self.progress(text)
 
     @cached_property
     def pooled(self) -> Triangles:

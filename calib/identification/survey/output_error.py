@@ -16,6 +16,8 @@ covariance H⁻¹ S H⁻¹ accounts for this, with S the scatter of the scores (
 What slides call CLIE, (ZᵀZ)⁻¹Zᵀy with Z the simulated observation matrix, is the survey's DIDIM; so it is here.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -30,18 +32,22 @@ from calib.estimation.linear import LinearFit
 from calib.estimation.triangles import condition_numbers, require_rank
 from calib.identification.closed_loop.loop_recordings import (
     ClosedLoops,
+    Loop,
     close_loops,
     followed,
     low_passed,
     simulated_samples,
 )
+from calib.identification.closed_loop.sign_noise import SEED, position_noise
 from calib.identification.closed_loop.simulated import attempted_in_loop
 from calib.identification.closed_loop.simulation import Plant, Sensing
+from calib.identification.loop import LoopController
 from calib.identification.methods.least_squares import WLS
 from calib.identification.methods.method import EstimateStatus, IdentificationProblem, Method, MethodEstimate
 from calib.identification.rows import Case, thinned
 from calib.identification.survey.score_covariance import scatter
 from calib.identification.survey.simulated_robot import BelievedRobot, Sensitivities, believed_robot, start_of
+from calib.records import field_values
 
 
 @dataclass(frozen=True)
@@ -85,13 +91,14 @@ class _OutputError(Method):
         task = _Comparison(problem, robot, loops, self.torques)
         return attempted_in_loop(self.name, problem, loops, lambda: self._estimate(problem, plain, task))
 
-    def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, task: "_Comparison") -> MethodEstimate:
+    def _estimate(self, problem: IdentificationProblem, plain: MethodEstimate, task: _Comparison) -> MethodEstimate:
         loops = task.loops
         with np.errstate(divide="ignore", invalid="ignore"):
             inertia = loops.controller.kd**2 / (2.0 * loops.controller.kp)
         inertia = np.where(np.isfinite(inertia) & (inertia > 0.0), inertia, 1.0)
         values = start_of(problem, plain.estimate.values, inertia, lambda x: task.simulated(task.whole(x, inertia)))
         values = task.whole(values, inertia)
+        task = task.with_noise(values)
         first, _ = task.linearised(values)
         std = task.spread(first, 0)
         count = 1
@@ -130,6 +137,8 @@ class _OutputError(Method):
 class _Comparison:
     """Signals to compare, positions or torques of the recordings' control loops; `count` counts the simulations.
 
+    `noise` is that in each loop (N, n) [rad or m], drawn once; None for a recording without.
+
     Rows (M, r) are those of the torque sensors, if the problem has any, then r = n of the positions or motor torques.
     """
 
@@ -138,6 +147,7 @@ class _Comparison:
     loops: ClosedLoops
     torques: bool
     count: list[int] = field(default_factory=lambda: [0])
+    noise: tuple[np.ndarray | None, ...] = ()
 
     @property
     def rows(self) -> TorqueRows:
@@ -171,7 +181,7 @@ class _Comparison:
         """Return residuals (M, r), zero at samples not compared, and the Jacobian (M, r, p) of simulated signals."""
         residuals = []
         slopes = []
-        for case, loop in self.loops.pairs:
+        for (case, loop), drawn in zip(self.loops.pairs, self.noise, strict=True):
             plant = self.robot.at(values, case)
             controller = loop.controller
             relative = None
@@ -179,8 +189,7 @@ class _Comparison:
                 diagonal = plant.inertia_diagonal(loop.reference.q[::200])
                 controller = controller.scaled(diagonal / loop.design)
                 relative = self._inertia_slopes(loop.reference.q[::200]) / diagonal[:, None]
-            self.count[0] += 1
-            run = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative)
+            run = self._mean_run(values, case, controller, loop, relative, drawn)
             index = simulated_samples(case, run.t, loop)
             motion = case.motion
             # Residuals and their slopes, in the order of the rows.
@@ -211,6 +220,34 @@ class _Comparison:
             residuals.append(np.where(in_use, residual, 0.0))
             slopes.append(np.where(in_use[:, :, None], slope, 0.0))
         return np.concatenate(residuals), np.concatenate(slopes)
+
+    def with_noise(self, values: np.ndarray) -> _Comparison:
+        """Return the comparison with the recordings' noise in the loop, as their torques answer it."""
+        noise = []
+        for case, loop in self.loops.pairs:
+            sigma = position_noise(self.robot.at(values), case, loop).loop
+            drawn = np.random.default_rng(SEED).normal(size=loop.reference.q.shape) * sigma
+            noise.append(drawn if np.any(sigma) else None)
+        return replace(self, noise=tuple(noise))
+
+    def _mean_run(
+        self,
+        values: np.ndarray,
+        case: Case,
+        controller: LoopController,
+        loop: Loop,
+        relative: np.ndarray | None,
+        drawn: np.ndarray | None,
+    ) -> Sensitivities:
+        """Return the mean of runs with noise `drawn` in the loop and with its opposite; one run where there is none."""
+        self.count[0] += 1
+        first = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative, drawn)
+        if drawn is None or self.robot.steps is not None:
+            return first
+        self.count[0] += 1
+        second = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative, -drawn)
+        means = {name: 0.5 * (value + getattr(second, name)) for name, value in field_values(first).items()}
+        return Sensitivities(**means)
 
     def _sensed(self, plant: Plant, case: Case, run: Sensitivities, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return residuals (N, n) of the sensors' torques [N m or N], and the Jacobian (N, n, p) of simulated ones."""
@@ -259,7 +296,11 @@ class _Comparison:
         step_tolerance = 0.05
 
         def linearise(x: np.ndarray) -> nonlinear.Reduced:
-            return nonlinear.triangle(*self.whitened(x, std))
+            residual, slopes = self.whitened(x, std)
+            rms = float(np.sqrt(np.mean(residual**2)))
+            compared = "torques" if self.torques else "positions"
+            self.problem.say(f"{compared} compared after {self.count[0]} simulations: residual {rms:.4g} σ")
+            return nonlinear.triangle(residual, slopes)
 
         def moved(x: np.ndarray, step: np.ndarray) -> np.ndarray:
             return x + step

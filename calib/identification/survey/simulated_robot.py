@@ -34,7 +34,7 @@ from calib.records import frozen, shaped
 
 @dataclass(frozen=True, eq=False)
 class Sensitivities:
-    """Simulated noise-free motion of M samples, and its derivatives with respect to c parameters.
+    """Simulated motion of M samples, and its derivatives with respect to c parameters.
 
     Attributes:
         t: (M,) [s].
@@ -58,8 +58,9 @@ def simulate_tangents(
     columns: np.ndarray,
     every: float = 1,
     relative: np.ndarray | None = None,
+    noise: np.ndarray | None = None,
 ) -> Sensitivities:
-    """Return a noise-free simulated motion along a reference, and its exact derivatives with respect to the parameters.
+    """Return a simulated motion along a reference, and its exact derivatives with respect to the parameters.
 
     Args:
         plant: plant whose friction depends on position and velocity alone.
@@ -67,6 +68,7 @@ def simulate_tangents(
         every: control periods per sample.
         relative: (n, c) slopes of the logarithm of all gains of a joint by the parameters, where the gains follow them
             (`calib.identification.closed_loop.loop_recordings.Loop.design`); None: the gains are constant.
+        noise: (N, n) noise of the measured positions, on which the controller acts [rad or m]; None: none.
 
     Raises:
         CalibError: where the inertia is not positive definite, friction too stiff, or of a kind without slopes.
@@ -103,6 +105,7 @@ def simulate_tangents(
         controller.rows,
         scale,
         reference.sampled(controller.ahead),
+        np.empty((0, n)) if noise is None else np.ascontiguousarray(shaped(noise, reference.q.shape, "noise")),
         reference.period,
         controller.smoothing(reference.period),
         controller.delay,
@@ -253,12 +256,16 @@ class BelievedRobot:
         reference: Reference,
         every: float,
         relative: np.ndarray | None = None,
+        noise: np.ndarray | None = None,
     ) -> Sensitivities:
-        """Return the simulated motion with parameters (p,) and its slopes by them; none by payloads not attached."""
+        """Return the simulated motion with parameters (p,) and its slopes by them; none by payloads not attached.
+
+        A robot without tangents is simulated without the noise.
+        """
         plant = self.at(values, case)
         if self.steps is not None:
             return simulate_differences(plant, controller, reference, self.columns, self.steps, every)
-        sensitivities = simulate_tangents(plant, controller, reference, self.columns, every, relative)
+        sensitivities = simulate_tangents(plant, controller, reference, self.columns, every, relative, noise)
         carried = self.carried(case)
         by_q = sensitivities.by_q * carried
         by_v = sensitivities.by_v * carried

@@ -416,12 +416,6 @@ class ParallelModel:
             actuated_terms.append(replace(term, acts=((joint, ((joint, 1.0),)),)))
         return ParallelPlant(replace(self, terms=(*self.terms, *actuated_terms)), values)
 
-    def joint_noise(self, noise: np.ndarray) -> np.ndarray:
-        """Return the velocity noise (n_t,) of all joints at home from that of the actuated ones (n,)."""
-        at_home = loop_jacobians(self.mechanism, self.mechanism.home)
-        by_reading = at_home.joints[0] @ np.linalg.pinv(at_home.readings[0])
-        return np.sqrt(by_reading**2 @ noise**2)
-
     def load_cases(self) -> Loads:
         if self.payloads:
             return (None, ())
