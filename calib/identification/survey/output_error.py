@@ -6,12 +6,16 @@
 With joint torque sensors (rows link, both) both compare their torques too, which are an output of the loop: simulated
 ones are those of the bodies and the link side along the simulated motion, filtered like the recorded one (our choice).
 
-q_s and tau_s of the loop simulated without noise (Leboutet et al. 2021, sections 5.1 and 5.2, after Landau 1979;
-Gautier, Janot & Vandanjon 2013), each joint weighted by its residuals. Damped Gauss–Newton steps need ∂q_s/∂χ and
-∂tau_s/∂χ: here the tangents of the simulation itself in one pass (`tangent_kernels`) where differences take one
-simulation per parameter, as they do for parallel robots. Torques of redundant actuators are compared on the platform's
-coordinates, as least squares takes them. The residuals are the effect of noise in the loop, correlated over time; the
-covariance H⁻¹ S H⁻¹ accounts for this, with S the scatter of the scores (`score_covariance`).
+q_s and tau_s of the simulated loop (Leboutet et al. 2021, sections 5.1 and 5.2, after Landau 1979; Gautier, Janot &
+Vandanjon 2013). They simulate without noise; where the torques show noise in the recording's loop (`sign_noise`), here
+the mean of two runs with opposite noise is taken, since an arm that shakes has less Coulomb friction in the mean (our
+choice). Robots without tangents are simulated without noise.
+
+Each joint is weighted by its residuals. Damped Gauss–Newton steps need ∂q_s/∂χ and ∂tau_s/∂χ: here the tangents of the
+simulation itself in one pass (`tangent_kernels`) where differences take one simulation per parameter, as they do for
+parallel robots. Torques of redundant actuators are compared on the platform's coordinates, as least squares takes them.
+The residuals are the effect of noise in the loop, correlated over time; the covariance H⁻¹ S H⁻¹ accounts for this,
+with S the scatter of the scores (`score_covariance`).
 
 What slides call CLIE, (ZᵀZ)⁻¹Zᵀy with Z the simulated observation matrix, is the survey's DIDIM; so it is here.
 """
@@ -223,6 +227,8 @@ class _Comparison:
 
     def with_noise(self, values: np.ndarray) -> _Comparison:
         """Return the comparison with the recordings' noise in the loop, as their torques answer it."""
+        if self.robot.steps is not None:
+            return replace(self, noise=(None,) * len(self.loops.pairs))
         noise = []
         for case, loop in self.loops.pairs:
             sigma = position_noise(self.robot.at(values), case, loop).loop
@@ -242,7 +248,7 @@ class _Comparison:
         """Return the mean of runs with noise `drawn` in the loop and with its opposite; one run where there is none."""
         self.count[0] += 1
         first = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative, drawn)
-        if drawn is None or self.robot.steps is not None:
+        if drawn is None:
             return first
         self.count[0] += 1
         second = self.robot.sensitivities(values, case, controller, loop.reference, loop.every, relative, -drawn)
