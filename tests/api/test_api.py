@@ -99,12 +99,14 @@ def model(logs: Path) -> calib.DynamicsModel:
         (lambda: calib.ExcitationSettings(period=-1.0), "period"),
     ],
 )
-def test_an_argument_of_another_type_is_refused_by_its_name(call, words):
+def test_argument_of_wrong_type_is_named(call, words):
+    """An argument of another type is refused by its name."""
     with pytest.raises(calib.CalibError, match=words):
         call()
 
 
-def test_numbers_and_sequences_of_numpy_are_numbers_and_sequences():
+def test_numpy_scalars_and_arrays_accepted():
+    """NumPy's numbers and sequences are numbers and sequences."""
     start, tool = np.zeros(6), np.array([[0.1, 0.0, 0.0]])
     assert calib.ExcitationSettings(period=np.float32(5), seed=np.int64(3), start=start, goals=["raw=35"]).seed == 3
     assert calib.SelectionSettings(tools=tool, seconds=2).tools == ((0.1, 0.0, 0.0),)  # type: ignore[arg-type]
@@ -128,12 +130,14 @@ def test_at_most_34_names_all_documented():
         calib.no_such_name  # noqa: B018
 
 
-def test_the_version_and_the_methods_can_be_asked_for(capsys):
+def test_version_and_methods_are_offered(capsys):
+    """The version and the methods can be asked for."""
     assert cli.run(["--version"]) == 0 and calib.__version__ in capsys.readouterr().out
     assert {"wls", "iv", "didim"} <= {one.name for one in calib.methods()}
 
 
-def test_settings_of_an_identification_are_the_keys_of_the_options_file():
+def test_settings_are_keys_of_options_file():
+    """Settings of an identification are the keys of the options file."""
     stated = calib.IdentifySettings(method="iv", filter={"cutoff": np.float64(20.0)}, keep=["ZZ1R"])  # type: ignore[arg-type]
     assert options_of(stated) == parse_options(
         {"method": "iv", "filter": {"cutoff": 20.0}, "keep": ["ZZ1R"]}, "settings"
@@ -153,7 +157,8 @@ def test_a_fit_is_what_the_command_writes(fitted, cell, tmp_path, capsys):
     assert all(line.strip() in " ".join(said.split()) for line in [f"verdict: {fitted.verdict.level}"])
 
 
-def test_measurements_and_robots_in_memory_are_the_same(fitted, cell):
+def test_measurements_and_robots_in_memory(fitted, cell):
+    """Measurements and robots in memory give what their files give."""
     robot = calib.load("ur5")
     blocks = calib.read_poses(cell / "measured.csv", robot)
     assert len(blocks[0]) == len(calib.read_poses(cell / "measured.csv", "ur5")[0]) == 60
@@ -162,7 +167,8 @@ def test_measurements_and_robots_in_memory_are_the_same(fitted, cell):
     np.testing.assert_array_equal(again.robot.covariance, fitted.robot.covariance)
 
 
-def test_measurements_in_memory_get_the_checks_of_files(fitted, cell):
+def test_measurements_in_memory_are_checked(fitted, cell):
+    """Measurements in memory get the checks of files."""
     block = calib.read_poses(cell / "measured.csv", "ur5")[0]
     odd = np.array(block.position)
     odd[2, 1] = np.nan
@@ -176,7 +182,8 @@ def test_measurements_in_memory_get_the_checks_of_files(fitted, cell):
             calib.fit_geometry("ur5", [wrong, cell / "other.csv"], fitted.settings)
 
 
-def test_what_readers_return_may_stand_among_files(fitted, cell):
+def test_readers_results_stand_among_files(fitted, cell):
+    """What readers return may stand among files."""
     both = [calib.read_poses(cell / "measured.csv", "ur5"), cell / "other.csv"]
     assert len(calib.fit_geometry("ur5", both, calib.FitSettings(model="geometry")).inputs.fit) == 2
     with pytest.raises(UsageError, match="unseen is empty"):
@@ -198,13 +205,15 @@ def test_a_robot_prints_as_a_short_table(fitted):
 @pytest.mark.parametrize(
     "stamps, words", [(lambda t: t[::-1], "time runs backwards"), (lambda t: np.nan * t, "column 't': found nan")]
 )
-def test_time_that_cannot_be_is_told_of_recordings_in_memory(logs, stamps, words):
+def test_impossible_time_in_memory_is_told(logs, stamps, words):
+    """An impossible time in recordings in memory is told."""
     given = calib.read_recording(logs / "train.npz", logs / "robot.toml")
     with pytest.raises(MeasurementError, match=words):
         calib.identify_dynamics(logs / "robot.toml", replace(given, t=stamps(np.array(given.t))))
 
 
-def test_validation_afterwards_is_validation_at_once(fitted, cell):
+def test_later_validation_equals_immediate(fitted, cell):
+    """Validation afterwards is validation at once."""
     robot, other = "ur5", cell / "other.csv"
     at_once = calib.fit_geometry(robot, cell / "measured.csv", fitted.settings, validate=other)
     later = calib.validate(fitted, other)
@@ -212,14 +221,16 @@ def test_validation_afterwards_is_validation_at_once(fitted, cell):
     assert "other.csv" in later.to_dict()["validation"] and "other.csv" not in fitted.to_dict()["validation"]
 
 
-def test_results_print_ladder_errors_and_verdict(fitted, model):
+def test_results_print_ladder_and_verdict(fitted, model):
+    """Results print the ladder, the errors and the verdict."""
     shown = str(fitted)
     assert fitted.verdict.reason.split(";")[0] in " ".join(shown.split()) and "nominal" in shown
     assert model.verdict.level in str(model) and "other.npz" in str(model)
     assert set(fitted.plot()) >= {"position", "parameters"} and set(model.plot()) >= {"torque_1", "friction"}
 
 
-def test_a_notebook_shows_the_page_and_a_verdict_equals_its_name(fitted, model):
+def test_notebook_shows_page_and_verdict(fitted, model):
+    """A notebook shows the page, and a verdict equals its name."""
     for result in (fitted, model):
         assert result.verdict == result.verdict.level and result.verdict != "other"
         assert result.verdict.reason[1:40] in unescape(result._repr_html_())
@@ -239,7 +250,8 @@ def test_one_figure_by_its_name(fitted, model):
         model.plot("frictoin")
 
 
-def test_tab_offers_what_there_is_and_no_more(fitted, model):
+def test_tab_offers_what_there_is(fitted, model):
+    """Tab offers what there is and no more."""
     assert "annotations" not in dir(calib) and "TYPE_CHECKING" not in dir(calib)
     for result in (fitted, model):
         wanted = [name for name in dir(result) if name != "residuals"]
@@ -248,7 +260,8 @@ def test_tab_offers_what_there_is_and_no_more(fitted, model):
     assert all(hasattr(calib.ExcitationDesign, name) for name in ("sampled", "plot", "save", "to_dict"))
 
 
-def test_residuals_are_a_frame_where_pandas_is_there(fitted, model, tmp_path, monkeypatch):
+def test_residuals_are_a_frame_with_pandas(fitted, model, tmp_path, monkeypatch):
+    """Residuals are a data frame where pandas is there."""
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(UsageError, match=r"need pandas: pip install 'armature-calib\[pandas\]'"):
         _ = fitted.residuals
@@ -264,7 +277,8 @@ def test_residuals_are_a_frame_where_pandas_is_there(fitted, model, tmp_path, mo
     np.testing.assert_array_equal(rows[-1][2:], last)
 
 
-def test_a_designed_motion_is_sampled_at_any_rate_without_interpolation(tmp_path):
+def test_designed_motion_is_sampled_exactly(tmp_path):
+    """A designed motion is sampled at any rate without interpolation."""
     settings = calib.ExcitationSettings(period=4.0, starts=1, evaluations=20, outlook=False, rate=100.0)
     design = calib.design_excitation("tx40", settings)
     t, q, v, a = design.sampled()
@@ -278,7 +292,7 @@ def test_a_designed_motion_is_sampled_at_any_rate_without_interpolation(tmp_path
     assert np.allclose(np.gradient(fine[1], fine[0], axis=0)[1:-1], fine[2][1:-1], atol=1e-3)
 
 
-def test_the_geometrys_covariance_reaches_the_dynamics_in_memory(logs):
+def test_geometry_noise_reaches_the_dynamics(logs):
     """Σ = Σ_torque + S Σ_geometry Sᵀ, without a file between fit and identification."""
     chain = description.read(logs / "robot.toml")
     exact = calib.identify_dynamics(calib.CalibratedChain(chain), logs / "train.npz", friction="standard")
@@ -291,7 +305,8 @@ def test_the_geometrys_covariance_reaches_the_dynamics_in_memory(logs):
     assert (unsure.estimate.sigma > 1.01 * exact.estimate.sigma).any()
 
 
-def test_recordings_in_memory_and_later_validation(model, logs):
+def test_recordings_in_memory_and_validation(model, logs):
+    """Recordings in memory are taken, and validation may come later."""
     robot = calib.load(logs / "robot.toml")
     log, other = (calib.read_recording(logs / f"{name}.npz", robot) for name in ("train", "other"))
     again = calib.identify_dynamics(robot, log, friction="standard")
@@ -310,7 +325,8 @@ def test_torques_have_sigmas(model):
     assert (np.median(fast, axis=0) > np.median(own, axis=0)).all()
 
 
-def test_export_and_compensation_take_results_in_memory(fitted, model, cell, logs, tmp_path, monkeypatch):
+def test_export_and_compensation_in_memory(fitted, model, cell, logs, tmp_path, monkeypatch):
+    """Export and compensation take results in memory."""
     written = calib.export(fitted, tmp_path / "geometry")
     assert (tmp_path / "geometry/robot.urdf").is_file() and any("robot.urdf" in line for line in written)
     calib.export(model, tmp_path / "dynamics")
@@ -329,7 +345,8 @@ def test_export_and_compensation_take_results_in_memory(fitted, model, cell, log
     assert commands.save(tmp_path / "commands.csv").is_file()
 
 
-def test_a_session_in_python_is_the_commands_session(logs, tmp_path, monkeypatch, capsys):
+def test_session_in_python_is_the_commands(logs, tmp_path, monkeypatch, capsys):
+    """A session in Python is the command's session."""
     monkeypatch.chdir(tmp_path)
     robot = str(logs / "robot.toml")
     made = calib.new_session("script", robot, "cmm", poses=8, validation=0, dynamics=False)
@@ -338,7 +355,7 @@ def test_a_session_in_python_is_the_commands_session(logs, tmp_path, monkeypatch
     own, other = (tomllib.loads((tmp_path / name / "session.toml").read_text()) for name in ("script", "command"))
     assert made == Path("script") and own | {"created": ""} == other | {"created": ""}
     script, command = calib.run_sessions(["script", "command/session.toml"], plots=False)
-    assert script.state == command.state == "waits" and "Bring script/3-measured/measured.csv" in str(script)
+    assert script.state == command.state == "waits" and "Provide script/3-measured/measured.csv" in str(script)
     assert cli.run(["run", "command", "--no-plots"]) == 0
     assert "command: waits" in capsys.readouterr().out
     assert (made / "2-poses/poses.csv").read_bytes() == (tmp_path / "command/2-poses/poses.csv").read_bytes()
@@ -346,9 +363,10 @@ def test_a_session_in_python_is_the_commands_session(logs, tmp_path, monkeypatch
         calib.run_sessions(["script", "script/session.toml"])
 
 
-def test_poses_chosen_without_constraints_say_what_they_keep_and_what_is_not_checked():
+def test_poses_without_constraints_say_so():
+    """Poses chosen without constraints say what they keep and what is not checked."""
     chosen = calib.select_poses("ur5", 8, calib.SelectionSettings(method="detmax", candidates=200))
-    assert "kept: 1 % of each joint's range to its limits, self-collision" in str(chosen)
+    assert "respected: 1 % of each joint's range to its limits, self-collision" in str(chosen)
     assert "NOT checked: line of sight (the instrument's position is not known), walls" in str(chosen)
     found = json.loads(json.dumps(chosen.to_dict()))
     assert found["random_baseline"] < found["value"] and 0.9 < found["efficiency"] <= 1.0

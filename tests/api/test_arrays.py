@@ -15,7 +15,8 @@ OFFSETS = calib.FitSettings(model="offsets")
 Q = np.random.default_rng(0).uniform(-2.0, 2.0, (60, 6))
 
 
-def test_a_fit_of_arrays_brings_back_the_robot_that_made_them():
+def test_fit_of_arrays_restores_their_robot():
+    """A fit of arrays brings back the robot that made them."""
     robot = calib.load("ur5")
     pose = robot.forward(Q)
     turns = Rotation.from_matrix(pose[:, :3, :3]).as_quat()
@@ -28,7 +29,7 @@ def test_a_fit_of_arrays_brings_back_the_robot_that_made_them():
         np.testing.assert_allclose(robot.forward(found), pose[:3], atol=1e-5)
 
 
-def test_a_fit_predicts_the_tool_and_how_well_it_knows_it():
+def test_fit_predicts_tool_and_its_error():
     """With noise of 0.1 mm per axis: errors at new poses are below what is expected of them."""
     robot, rng = calib.load("ur5"), np.random.default_rng(1)
     fit = calib.fit_geometry(
@@ -44,7 +45,8 @@ def test_a_fit_predicts_the_tool_and_how_well_it_knows_it():
         fit.predict(q[:, :5])
 
 
-def test_the_jacobian_is_the_slope_of_the_pose():
+def test_jacobian_is_slope_of_pose():
+    """The Jacobian is the slope of the pose."""
     robot, step = calib.load("ur5"), 1e-6
     for j in range(6):
         away = step * np.eye(6)[j]
@@ -57,7 +59,8 @@ def test_a_recording_of_arrays_has_names():
     assert log.joint_names == ("q1", "q2", "q3", "q4", "q5", "q6") and log.kind == "torque"
 
 
-def test_waypoints_limits_and_poses_in_memory_are_those_of_files(tmp_path):
+def test_waypoints_limits_poses_in_memory(tmp_path):
+    """Waypoints, limits and poses in memory are those of files."""
     way, limits = np.array([[0.0, -1.2, 1.2, 0.0, 0.6, 0.1], [0.8, -0.6, 0.9, 0.4, 0.2, 0.0]]), tmp_path / "l.toml"
     limits.write_text('[velocity]\nall = "60 deg/s"\n[acceleration]\nall = 4.0\n')
     (tmp_path / "way.csv").write_text("\n".join(["q1,q2,q3,q4,q5,q6", *(",".join(map(str, q)) for q in way)]))
@@ -72,7 +75,8 @@ def test_waypoints_limits_and_poses_in_memory_are_those_of_files(tmp_path):
 
 
 @pytest.mark.slow
-def test_constraints_and_poses_measured_before_are_values_too(tmp_path):
+def test_constraints_and_poses_are_values(tmp_path):
+    """Constraints, and poses measured before, are values, too."""
     (tmp_path / "c.toml").write_text("[joints]\nq1 = [-1.0, 1.0]\n")
     (tmp_path / "p.csv").write_text("\n".join(["q1,q2,q3,q4,q5,q6", *(",".join(map(str, q)) for q in Q[:20])]))
     settings = calib.SelectionSettings(method="detmax", candidates=100, climbs=0)
@@ -90,7 +94,8 @@ def test_constraints_and_poses_measured_before_are_values_too(tmp_path):
         np.testing.assert_array_equal(q, by_file)
 
 
-def test_a_notebook_shows_progress_in_one_line(monkeypatch):
+def test_notebook_shows_progress_in_one_line(monkeypatch):
+    """A notebook shows progress in one line."""
     said = []
     line = SimpleNamespace(update=lambda content, raw: said.append(content.get("text/plain")))
     display = SimpleNamespace(display=lambda content, raw, display_id: line)

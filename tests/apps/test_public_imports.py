@@ -83,7 +83,8 @@ def test_every_form_of_import_is_read():
     ]
 
 
-def test_the_public_parts_offer_what_they_list():
+def test_public_parts_offer_what_they_list():
+    """The public parts offer what they list."""
     for path in sorted((APPS.parent / "toolkit").glob("[a-z]*.py")):
         module = import_module(f"calib.toolkit.{path.stem}")
         assert [name for name in module.__all__ if not hasattr(module, name)] == []

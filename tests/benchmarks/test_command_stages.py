@@ -10,7 +10,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 import command_stages  # pyright: ignore[reportMissingImports]
 
 
-def test_time_counts_for_the_innermost_stage_and_adds_up(monkeypatch):
+def test_time_counts_for_innermost_stage(monkeypatch):
+    """Time counts for the innermost stage and adds up."""
     seconds = count(0.0)  # every look at the clock is a second later
     monkeypatch.setattr(command_stages.time, "process_time", lambda: next(seconds))
     clock = command_stages.Clock()

@@ -95,7 +95,7 @@ def test_constrained_instruments(recorded, name, free):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 8])
-def test_a_step_that_ends_where_the_loop_is_hardly_stable_is_no_dead_end(seed):
+def test_hardly_stable_step_is_no_dead_end(seed):
     """Whichever way the noise, or the processor's kernels, lead the iterations: the bound binds, and the rest fits.
 
     With these seeds a quarter of the second step could be simulated, and nothing further from there.

@@ -27,7 +27,7 @@ from calib.trajectories.design.objectives import Excitation
 from calib.trajectories.design.problem import ExcitationProblem, evaluate
 from calib.trajectories.design.starts import random_start
 from calib.trajectories.fourier import fourier_family
-from calib.trajectories.places import Workspace
+from calib.trajectories.workspace_limits import Workspace
 
 CHAIN = load("lwr4plus")
 FC = (11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04)
@@ -78,7 +78,8 @@ def processor_time(call: Callable, rounds: int = 15) -> float:
 
 @pytest.mark.parametrize("harmonics", [5, 10])
 @pytest.mark.parametrize("samples", [200, 1000])
-def test_value_and_gradient_of_cond_against_differences(benchmark, harmonics, samples):
+def test_cond_gradient_against_differences(benchmark, harmonics, samples):
+    """Value and gradient of cond, against differences."""
     spot = problem(20.0, harmonics, samples, constrained=False)
     basis = spot.basis()
     x = random_start(problem(20.0, harmonics), basis, np.random.default_rng(0))

@@ -31,7 +31,8 @@ def test_rows_reach_the_sizes_asked_for(about):
     assert all(one[-1] >= ASKED[about][1] for one in sizes)
 
 
-def test_nothing_of_ours_grows_faster_than_its_work():
+def test_nothing_grows_faster_than_its_work():
+    """Nothing of ours grows faster than its work."""
     assert growth.above_limit(ROWS) == []
 
 

@@ -41,7 +41,8 @@ def test_a_unit_in_the_header_is_converted(write, heading, dimension, factor):
     np.testing.assert_allclose(table.numbers("v", dimension), 3 * factor, rtol=1e-15)
 
 
-def test_byte_order_mark_comments_blank_lines_and_quotes(tmp_path):
+def test_byte_order_mark_blanks_and_quotes(tmp_path):
+    """Byte order mark, comments, blank lines and quotes."""
     path = tmp_path / "bom.csv"
     path.write_bytes(
         '\ufeff# by hand\n\n"a, first",b\r\n1,2\r\n# no row\r\n\r\n3,4\r\n,,\r\n'.replace(",,", ",").encode()
@@ -52,7 +53,8 @@ def test_byte_order_mark_comments_blank_lines_and_quotes(tmp_path):
     np.testing.assert_array_equal(table.rows, [1, 2])
 
 
-def test_a_comment_names_the_columns_where_nothing_else_does(tmp_path):
+def test_comment_may_name_columns(tmp_path):
+    """A comment names the columns where nothing else does."""
     path = tmp_path / "savetxt.csv"
     np.savetxt(path, [[1.0, 2.0], [3.0, 4.0]], delimiter=",", header="q1,x [mm]")
     table = read_table(path)
@@ -60,7 +62,8 @@ def test_a_comment_names_the_columns_where_nothing_else_does(tmp_path):
     np.testing.assert_allclose(table.numbers("x", "length"), [0.002, 0.004])
 
 
-def test_a_large_table_is_read_in_chunks_without_loss(write):
+def test_large_table_is_read_in_chunks(write):
+    """A large table is read in chunks without loss."""
     values = np.random.default_rng(1).normal(size=(50_000, 2))
     path = write(
         "a,b,c", "\n".join(f"{a!r},{b!r},{'' if i == 49_999 else 1}" for i, (a, b) in enumerate(values.tolist()))
@@ -73,7 +76,8 @@ def test_a_large_table_is_read_in_chunks_without_loss(write):
     assert (error.value.row, error.value.column) == (50_000, "c")
 
 
-def test_text_and_ragged_rows_far_down_keep_their_numbers(write):
+def test_ragged_rows_keep_their_numbers(write):
+    """Text and ragged rows far down keep their numbers."""
     table = read_table(write("a,b", "\n".join(["1,2"] * 25_000 + ["x,2"])))
     assert table.texts("a")[0] == "1" and table.texts("a")[-1] == "x"
     with pytest.raises(MeasurementError, match="'x' where a number is needed") as error:
@@ -84,7 +88,8 @@ def test_text_and_ragged_rows_far_down_keep_their_numbers(write):
     assert error.value.row == 40_003
 
 
-def test_damaged_cells_are_told_over_all_columns_from_the_first_row(write):
+def test_damaged_cells_told_over_all_columns(write):
+    """Damaged cells are told over all columns from the first row."""
     rows = [["1", "2", "3"] for _ in range(45_000)]
     rows[30_000][0], rows[700][1], rows[700][2], rows[44_000][2] = "ERR", "", "nan", "n/a"
     table = read_table(write("a,b,c", "\n".join(map(",".join, rows))))
@@ -99,7 +104,8 @@ def test_damaged_cells_are_told_over_all_columns_from_the_first_row(write):
     assert sum(column.sum() for column in table.where(keep).check(("a", "b", "c"))) == 6 * 44_997
 
 
-def test_a_file_that_ends_within_a_line_says_so(write):
+def test_truncated_file_says_so(write):
+    """A file that ends within a line says so."""
     with pytest.raises(MeasurementError, match=r"ends here, in the middle of a line .* delete its last line") as error:
         read_table(write("a,b,c", "1,2,3\n" * 100 + "4,5"))
     assert error.value.row == 101
@@ -107,7 +113,8 @@ def test_a_file_that_ends_within_a_line_says_so(write):
         read_table(write("a,b,c", "1,2,3\n4,5\n6,7,8\n"))
 
 
-def test_a_spreadsheets_error_is_a_cell_and_no_comment(write):
+def test_spreadsheet_error_is_no_comment(write):
+    """A spreadsheet's error is a cell and no comment."""
     table = read_table(write("a,b", "1,2\n#REF!,3\n# note, 4\n5,6"))
     assert table.texts("a") == ["1", "#REF!", "5"]
 
@@ -165,13 +172,14 @@ def test_a_cell_that_is_no_number_is_named(write, cell, words):
         ("xx", "length", "", r"'x' is missing"),
     ],
 )
-def test_a_column_that_is_not_what_it_should_be_is_refused(write, heading, dimension, unit, words):
+def test_unfit_column_is_refused(write, heading, dimension, unit, words):
+    """A column that is not what it should be is refused."""
     with pytest.raises(MeasurementError, match=words) as error:
         read_table(write(f"{heading},y", "1,2")).numbers("x", dimension, unit)
     assert error.value.column == (None if heading == "xx" else "x")
 
 
-def test_a_table_of_no_rows_has_columns_of_no_numbers(write):
+def test_table_without_rows_has_columns(write):
     """As what remains of a table when none of its rows holds a position."""
     table = read_table(write("x [mm],y [deg]", ",1\n,2")).where(np.zeros(2, dtype=bool))
     assert table.numbers("x", "length", gaps=True).shape == table.numbers("y", "angle").shape == (0,)
@@ -191,7 +199,8 @@ def test_numbers_are_written_as_rows_are(tmp_path):
     assert files.write_numbers(tmp_path / "numbers.csv", header, values).read_bytes() == plain
 
 
-def test_a_name_that_is_a_formula_is_text_in_a_spreadsheet_and_itself_when_read_back(tmp_path):
+def test_formula_name_is_text_and_reads_back(tmp_path):
+    """A name that is a formula is text in a spreadsheet, and itself when read back."""
     names = ["=1+1", "+a", "-b", "@c", "'=d", "'", "e", "-1.5"]
     path = files.write_table(
         tmp_path / "t.csv", ["=x [mm]", "name"], [[float(k), name] for k, name in enumerate(names)]

@@ -25,7 +25,8 @@ def recording() -> Recording:
     return Recording.of(t, q + 1e-6 * noise, 3.0 * q + 0.1 * noise)
 
 
-def test_pieces_are_spread_over_the_recording_and_as_many_as_asked_for():
+def test_pieces_spread_over_recording():
+    """Pieces are spread over the recording, and as many as asked for."""
     rows, notes = rows_in_pieces(np.arange(181_000.0), 1000, 181_000, 20_000)
     parts = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
     assert len(rows) == 20_000 and len(parts) == 20 and "20000 of 180000" in notes[0]
@@ -34,7 +35,8 @@ def test_pieces_are_spread_over_the_recording_and_as_many_as_asked_for():
     assert len({int(part[0] - 1000) % 9000 for part in parts}) > 15  # no phase of a motion is met each time
 
 
-def test_faults_of_the_time_are_counted_over_the_whole_log_and_the_cut_leads_around_all_of_them(recording, tmp_path):
+def test_cut_leads_around_all_time_faults(recording, tmp_path):
+    """Faults of the time are counted over the whole log, and the cut leads around all of them."""
     t = recording.t.copy()
     back = np.random.default_rng(1).choice(len(t) // 2, 150, replace=False)
     t[back] -= 0.5
@@ -49,7 +51,8 @@ def test_faults_of_the_time_are_counted_over_the_whole_log_and_the_cut_leads_aro
     assert part.t[-1] - part.t[0] > 800.0
 
 
-def test_faults_of_values_are_counted_among_the_rows_that_were_read(recording, tmp_path):
+def test_value_faults_count_in_rows_read(recording, tmp_path):
+    """Faults of values are counted among the rows that were read."""
     q = recording.q.copy()
     q[::1000, 1] = np.nan
     np.savez(tmp_path / "log.npz", t=recording.t, q=q, tau=recording.effort)
@@ -70,7 +73,8 @@ def test_a_short_recording_is_used_whole(recording):
 
 
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed, "csv"])
-def test_every_file_is_read_in_the_same_pieces(recording, save, tmp_path):
+def test_files_share_their_pieces(recording, save, tmp_path):
+    """Every file is read in the same pieces."""
     if save == "csv":
         path = tmp_path / "log.csv"
         table = np.hstack([recording.t[:, None], recording.q, recording.effort])
@@ -91,7 +95,8 @@ def test_a_cut_is_taken_before_the_pieces(recording, tmp_path):
     assert len(found) == 20_000 and found.t[0] >= 600.0 and 1180.0 < found.t[-1] < 1200.0
 
 
-def test_pieces_become_segments_without_a_line_each(recording):
+def test_pieces_become_silent_segments(recording):
+    """Pieces become segments without a line each."""
     used = in_pieces(recording, 20_000)
     sampled = resample(used)
     assert sampled.segment[-1] == 19 and sampled.report.lost == 0
@@ -103,14 +108,16 @@ def test_pieces_become_segments_without_a_line_each(recording):
     assert motion.decimator.factor == whole.decimator.factor
 
 
-def test_motion_that_fills_only_the_end_of_a_recording_counts(recording):
+def test_motion_at_the_end_alone_counts(recording):
+    """Motion that fills only the end of a recording counts."""
     slow = 0.01 * np.sin(2 * np.pi * 0.05 * recording.t)[:, None]
     late = np.where(recording.t[:, None] > 900.0, recording.q, slow)
     motion = make_motion(in_pieces(dataclasses.replace(recording, q=late), 20_000))
     assert motion.cutoffs.band == pytest.approx(make_motion(in_pieces(recording, 20_000)).cutoffs.band, rel=0.3)
 
 
-def test_a_number_of_samples_that_is_none_is_refused():
+def test_impossible_sample_count_is_refused():
+    """An impossible number of samples is refused."""
     from calib.errors import UsageError
     from calib.identification.identify_options import parse_options
 

@@ -11,7 +11,8 @@ EXAMPLE = Path(__file__).parents[2] / "examples/camera/accuracy.py"
 
 
 @pytest.mark.slow
-def test_reprojection_beats_two_steps_on_rendered_images(tmp_path):
+def test_reprojection_beats_two_steps(tmp_path):
+    """Reprojection beats two steps on rendered images."""
     subprocess.run([sys.executable, str(EXAMPLE), "--quick", "--out", str(tmp_path)], check=True, capture_output=True)
     found = json.loads((tmp_path / "metrics.json").read_text())
     stiff = found["rigid arm, rendered images"]
@@ -24,7 +25,8 @@ def test_reprojection_beats_two_steps_on_rendered_images(tmp_path):
 
 
 @pytest.mark.slow
-def test_stated_sigmas_hold_and_reprojection_is_better_over_seeds(tmp_path):
+def test_reprojection_is_better_over_seeds(tmp_path):
+    """Stated sigmas hold, and reprojection is better over seeds."""
     subprocess.run(
         [sys.executable, str(EXAMPLE), "--seeds", "8", "--out", str(tmp_path)], check=True, capture_output=True
     )

@@ -16,7 +16,8 @@ def rows(text: str) -> dict[str, list[str]]:
 
 
 @pytest.mark.slow
-def test_each_arm_is_corrected_and_the_readme_states_what_a_fresh_run_finds(tmp_path):
+def test_arms_are_corrected_as_readme_states(tmp_path):
+    """Each arm is corrected, and the README states what a fresh run finds."""
     ran = subprocess.run(
         [sys.executable, str(EXAMPLE / "rehearsal.py"), "--out", str(tmp_path / "r")],
         check=True, capture_output=True, text=True,

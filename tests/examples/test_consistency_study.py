@@ -11,7 +11,8 @@ EXAMPLE = Path(__file__).parents[2] / "examples/lwr4plus/consistency.py"
 
 
 @pytest.mark.slow
-def test_calibrated_geometry_takes_the_bias_away_and_propagation_fills_the_intervals(tmp_path):
+def test_calibrated_geometry_removes_bias(tmp_path):
+    """Calibrated geometry takes the bias away, and propagation fills the intervals."""
     command = [sys.executable, str(EXAMPLE), "--runs", "3", "--out", str(tmp_path)]
     subprocess.run(command, check=True, capture_output=True, text=True)
     metrics = json.loads((tmp_path / "metrics.json").read_text())

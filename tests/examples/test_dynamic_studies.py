@@ -27,7 +27,7 @@ def check_claims(metrics: dict) -> None:
 
 
 @pytest.mark.slow
-def test_tx40_readme_holds_what_a_fresh_run_gives(tmp_path):
+def test_tx40_readme_holds_fresh_results(tmp_path):
     """Cell by cell within 0.3 %, and the claims of the text."""
     place = EXAMPLES / "tx40"
     command = [sys.executable, str(place / "identification.py"), "--out", str(tmp_path)]

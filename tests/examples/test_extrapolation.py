@@ -35,7 +35,7 @@ def test_every_pair_stands_in_the_document() -> None:
     assert len(PAIRS) >= 60 and sum(pair.across for pair in PAIRS) >= 30
 
 
-def test_simulated_motors_see_what_inverse_dynamics_and_friction_need(tmp_path) -> None:
+def test_motors_see_dynamics_and_friction(tmp_path) -> None:
     """At rest in one posture the torque is gravity's of the true arm, offset and cable aside."""
     import extrapolation_simulated as simulated
     import pinocchio as pin
@@ -51,7 +51,7 @@ def test_simulated_motors_see_what_inverse_dynamics_and_friction_need(tmp_path) 
     assert np.abs(gravity).max() > 0.1 * robot.effort.max()
 
 
-def test_the_plain_references_find_a_simple_arm(tmp_path) -> None:
+def test_plain_references_find_simple_arm(tmp_path) -> None:
     """Rich motion of an arm with plain friction is predicted within 5 %."""
     import extrapolation
     import extrapolation_plain as plain
@@ -67,7 +67,8 @@ def test_the_plain_references_find_a_simple_arm(tmp_path) -> None:
 
 
 @pytest.mark.slow
-def test_the_document_states_what_a_fresh_run_gives(data, tmp_path) -> None:
+def test_document_states_fresh_results(data, tmp_path) -> None:
+    """The document states what a fresh run gives."""
     environment = os.environ | {"OPENBLAS_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "CALIB_DATA": str(DATA)}
     command = [sys.executable, str(PARTS / "extrapolation.py"), "--out", str(tmp_path), "--only", *CHOSEN]
     said = subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout

@@ -28,20 +28,23 @@ def test_parameters_and_poses_are_the_papers(metrics: dict) -> None:
     assert metrics["parameters"] == 32 and metrics["poses"] == 17
 
 
-def test_nominal_rows_tell_installations_from_arms(metrics: dict) -> None:
+def test_nominal_rows_tell_installations(metrics: dict) -> None:
+    """Nominal rows tell installations from arms."""
     rows = {name: entry["position_mm"]["mean"] for name, entry in metrics["table_3"]["nominal"].items()}
     paper = lwr4plus.TABLE_3["nominal"]["position_mm"]["mean"]
     assert rows["full nominal column"] > 10 * paper
     assert rows["nominal arm, station and tool fitted"] == pytest.approx(paper, rel=0.25)
 
 
-def test_with_a_rigid_truth_the_covariance_holds(metrics: dict) -> None:
+def test_covariance_holds_for_rigid_truth(metrics: dict) -> None:
+    """With a rigid truth the covariance holds."""
     assert metrics["table_2"]["within_2_sigma_rigid_truth"]["weighted"] == pytest.approx(0.95 * 32, abs=0.7)
     assert metrics["table_2"]["within_2_sigma_rigid_truth"]["unweighted"] > 0.9 * 32
     assert metrics["eq_11_against_eq_12"]["largest_difference_in_sigmas"] < 1e-2
 
 
-def test_ranks_are_those_of_the_paper_and_of_the_algebra(metrics: dict) -> None:
+def test_ranks_agree_with_paper_and_algebra(metrics: dict) -> None:
+    """Ranks are those of the paper and of the algebra."""
     assert metrics["rank"]["alpha8 = d8 = 0"] == {"above 0.001": 32, "above 1e-09": 32}
     assert metrics["rank"]["calibrated"]["above 1e-09"] == 34
 

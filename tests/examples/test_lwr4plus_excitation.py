@@ -12,7 +12,8 @@ STUDIES = Path(__file__).parents[2] / "examples/lwr4plus"
 
 
 @pytest.mark.slow
-def test_exact_gradients_beat_differences_and_chance_in_the_same_time(tmp_path: Path) -> None:
+def test_exact_gradients_beat_differences(tmp_path: Path) -> None:
+    """Exact gradients beat differences and chance in the same time."""
     script = STUDIES / "excitation_peers.py"
     subprocess.run([sys.executable, script, "--out", tmp_path, "--quick"], check=True, capture_output=True)
     found = json.loads((tmp_path / "metrics.json").read_text())

@@ -42,7 +42,8 @@ def fresh(out: Path, name: str, *options: str) -> dict:
     return json.loads((out / "metrics.json").read_text(encoding="utf-8"))
 
 
-def test_every_table_of_the_study_stands_in_the_readme_and_holds_what_was_run() -> None:
+def test_readme_has_every_table_of_the_study() -> None:
+    """Every table of the study stands in the README and holds what was run."""
     assert set(BOUNDS) <= set(README)
     named = re.findall(r"^def (\w+)\(found: dict", Path(study_tables.__file__).read_text(), flags=re.MULTILINE)
     assert set(named) == set(study_tables.SHOW)
@@ -73,7 +74,8 @@ def check_dynamics(metrics: dict) -> None:
     ("name", "options"),
     [("geometry", ("--seeds", "0")), ("dynamics", ()), ("consistency", ("--runs", "0")), ("planning", ())],
 )
-def test_a_fresh_run_makes_the_readmes_tables(tmp_path: Path, name: str, options: tuple[str, ...]) -> None:
+def test_fresh_run_makes_readme_tables(tmp_path: Path, name: str, options: tuple[str, ...]) -> None:
+    """A fresh run makes the README's tables."""
     metrics = fresh(tmp_path, name, *options)
     if name == "dynamics":
         check_dynamics(metrics)
@@ -90,7 +92,8 @@ def test_a_fresh_run_makes_the_readmes_tables(tmp_path: Path, name: str, options
                 assert numbers(cell) == expected, (key, row)
 
 
-def test_the_kept_trajectory_b_is_the_readmes() -> None:
+def test_trajectory_b_is_the_readmes() -> None:
+    """The stored trajectory B is the README's."""
     import dynamics
     import excitation
 
@@ -115,7 +118,8 @@ def check_excitation(found: dict) -> None:
 
 
 @pytest.mark.slow
-def test_a_fresh_design_attains_the_papers_goals_and_lies_in_the_readmes_ranges(tmp_path: Path) -> None:
+def test_fresh_design_attains_paper_goals(tmp_path: Path) -> None:
+    """A fresh design attains the paper's goals and lies in the README's ranges."""
     found = fresh(tmp_path, "excitation", "--quick")
     check_excitation(found)
     assert {path.name for path in tmp_path.glob("*.png")} == {

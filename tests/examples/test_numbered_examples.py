@@ -25,7 +25,8 @@ def figures(pattern: str, said: str) -> list[float]:
     return [float(each) for each in re.findall(pattern, said)]
 
 
-def test_there_are_eight_and_each_is_read_in_a_minute():
+def test_eight_examples_read_in_a_minute():
+    """There are eight examples, and each is read in a minute."""
     assert [path.name[:2] for path in NUMBERED] == [f"0{k}" for k in range(1, 9)]
     for path in NUMBERED:
         lines = path.read_text(encoding="utf-8").splitlines()

@@ -16,7 +16,7 @@ BOUNDS = {"| value": 0.03, "| stated": 0.45, "| relative": 0.15, "| |": 0.45}
 
 
 @pytest.mark.slow
-def test_dualv_is_identified_by_both_models_and_its_payload_weighed(tmp_path):
+def test_dualv_is_identified_and_weighed(tmp_path):
     """Sixteen inertial base parameters, the payload to 1 %, IDIM tighter than PIM, equal legs tighter than unequal
     ones, other motion predicted better than the paper's 0.099, 0.084, 0.149: in the first of the README's
     five trials."""
@@ -63,7 +63,8 @@ def _loaded(name: str, path: Path):
 
 
 @pytest.mark.slow
-def test_decoupled_motion_brings_the_wrists_drives_out_of_the_power():
+def test_decoupled_motion_shows_wrist_drives():
+    """In the power of a decoupled motion the wrist's drives are better determined."""
     found = _loaded("power", EXAMPLES / "tx40" / "power.py").main()
     together, apart = found["power, all joints"], found["power, wrist apart"]
     assert apart["drives 4-6"] < 0.7 * together["drives 4-6"] and apart["bodies 4-6"] < together["bodies 4-6"]

@@ -17,7 +17,7 @@ def recordings(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("recordings")
-def test_the_plain_fit_of_the_iiwa_has_the_figure_of_the_prototype():
+def test_iiwa_plain_fit_has_prototype_rms():
     """Rms on its unseen file: 1.174 mm nominal, 0.589 mm by another plain fit with the same prior."""
     result = run(BY_NAME["iiwa7, positions, its files"], draw=0, plain_only=True)
     assert (result.nominal, result.plain) == pytest.approx((1.174, 0.589), rel=2e-3)
@@ -30,13 +30,15 @@ def test_the_plain_fit_of_the_iiwa_has_the_figure_of_the_prototype():
     [("iiwa7, positions, its files", 0), ("iiwa7, positions", 0), ("iiwa7, full poses", 0), ("positioner", 2)]
     + [("UR5, 15 poses", draw) for draw in range(3)],
 )
-def test_a_delivered_urdf_is_no_worse_than_the_plain_fit(name: str, draw: int):
+def test_delivered_urdf_is_no_worse(name: str, draw: int):
+    """A delivered URDF is no worse than the plain fit."""
     result = run(BY_NAME[name], draw)
     assert result.urdf <= WORSE * result.plain, result
 
 
 @pytest.mark.usefixtures("recordings")
-def test_a_split_holds_every_row_once_and_is_drawn_anew():
+def test_split_holds_every_row_once():
+    """A split holds every row once and is drawn anew."""
     row = Row("three of four", IIWA_POSES, draws=2, share=0.25)
     header, fitted, _, unseen = split(row, draw=0)
     assert len(fitted) == 228 and len(unseen) == 76 and not set(fitted) & set(unseen)

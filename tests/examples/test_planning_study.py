@@ -11,7 +11,8 @@ SCRIPT = Path(__file__).parents[2] / "examples/lwr4plus/planning.py"
 
 
 @pytest.mark.slow
-def test_the_identified_model_plans_what_the_robot_can_follow(tmp_path):
+def test_planned_motion_can_be_followed(tmp_path):
+    """The identified model plans what the robot can follow."""
     words = [sys.executable, SCRIPT, "--out", tmp_path, "--paths", "3"]
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     assert "true peak" in done.stdout

@@ -40,7 +40,7 @@ def test_a_public_arm_is_exported_right(data: Path, name: str):
     assert row.group == "noise level", row
 
 
-def test_errors_are_planted_in_the_arms_joints_alone():
+def test_errors_are_in_arm_joints_alone():
     """Over seeds positions have the stated size, turns too; what is no moving joint of the arm stays."""
     truths = [NOMINAL.with_errors(np.random.default_rng(seed)) for seed in range(100)]
     q = np.zeros((1, 3))
@@ -58,7 +58,8 @@ def test_both_readers_place_the_arm_alike():
     assert np.abs(pinocchio_poses(NOMINAL, q) - yourdfpy_poses(NOMINAL, q)).max() < 1e-12
 
 
-def test_postures_fill_the_limits_and_half_a_turn_of_a_continuous_joint():
+def test_postures_fill_the_limits():
+    """Postures fill the limits, and half a turn of a continuous joint."""
     q = NOMINAL.postures(2000, np.random.default_rng(0))
     assert q.max(axis=0) == pytest.approx([2.0, 2.0, np.pi], rel=0.01)
     assert q.min(axis=0) == pytest.approx([-2.0, -2.0, -np.pi], rel=0.01)

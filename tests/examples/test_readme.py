@@ -76,7 +76,8 @@ def test_its_four_lines_of_files_are_read(tmp_path: Path) -> None:
     assert log.kind == "torque" and log.effort.shape == (120, 6) and log.effort[0, 1] == 27.251
 
 
-def test_its_figures_of_real_robots_are_those_of_the_document() -> None:
+def test_figures_are_those_of_document() -> None:
+    """The README's figures of real robots are those of the document."""
     document = (ROOT / "examples/real_recordings.md").read_text()
     figures = r"(\S+)[^|]* \| (\S+) \((\S+)\)"  # nominal, calibrated, and in brackets what no URDF holds
     rows = re.findall(rf"^\| (\w+), (?:tracker|torques|currents) \| {figures}", README, flags=re.MULTILINE)

@@ -33,7 +33,8 @@ def test_every_row_stands_in_the_document(script):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", range(7))
-def test_the_document_states_what_a_fresh_run_gives(script, number, data, monkeypatch):
+def test_document_states_fresh_results(script, number, data, monkeypatch):
+    """The document states what a fresh run gives."""
     monkeypatch.setattr(script, "DATA", data)
     told, fresh = cells(TABLE.strip().splitlines()[2 + number]), cells(script.study(script.ROWS[number]))
     assert told[0] == fresh[0]

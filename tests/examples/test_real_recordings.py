@@ -35,13 +35,15 @@ def stated(row) -> list[tuple[float, float]]:
 
 
 @pytest.mark.parametrize("row", ROWS, ids=[row.document for row in ROWS])
-def test_every_row_of_the_command_stands_in_the_document(row) -> None:
+def test_command_rows_stand_in_document(row) -> None:
+    """Every row of the command stands in the document."""
     assert stated(row)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("row", ROWS, ids=[row.document for row in ROWS])
-def test_the_document_states_what_a_fresh_run_gives(row, data, monkeypatch) -> None:
+def test_document_states_fresh_results(row, data, monkeypatch) -> None:
+    """The document states what a fresh run gives."""
     monkeypatch.setattr(SCRIPT, "DATA", data)
     fresh = row.run()
     for value, (told, digit) in zip(fresh, stated(row)):

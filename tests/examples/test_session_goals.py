@@ -10,7 +10,7 @@ NEAR = 0.2  # relative: rounding ends the short search elsewhere (other kernels:
 
 
 @pytest.mark.slow
-def test_the_readme_states_what_a_fresh_run_gives(monkeypatch, tmp_path):
+def test_readme_states_fresh_results(monkeypatch, tmp_path):
     """Both sessions of the first seed; with the wrist's torque as second objective its parameters are known better."""
     monkeypatch.syspath_prepend(str(ROOT / "examples"))
     import session_goals

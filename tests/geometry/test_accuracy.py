@@ -25,7 +25,8 @@ def block(kind: str, **values) -> PoseMeasurements:
     return KINDS[kind](Q[: len(next(iter(values.values())))], CELL.chain.joint_names, **values)
 
 
-def test_position_and_orientation_are_lengths_of_vectors():
+def test_errors_are_lengths_of_vectors():
+    """Position and orientation are lengths of vectors."""
     shift = np.tile([3e-3, 0.0, 4e-3], (24, 1))
     turned = EXACT @ from_xyz_rpy([0, 0, 0], [np.radians(2.0), 0, 0])
     found = errors(CELL, [block("pose", position=EXACT[:, :3, 3] + shift, quaternion=to_quaternion(turned))]).summary()
@@ -41,7 +42,8 @@ def test_rms_is_that_of_the_norm():
     assert statistics(None) is None
 
 
-def test_positions_alone_have_no_orientation_and_distances_no_position():
+def test_positions_have_no_orientation():
+    """Positions alone have no orientation, and distances no position."""
     found = errors(CELL, [block("position", position=EXACT[:, :3, 3])]).summary()
     assert found.orientation_deg is None and found.position_mm.max < 1e-9
     known = np.linalg.norm(IN_BASE[0::2] - IN_BASE[1::2], axis=1) + 2e-3
@@ -60,7 +62,8 @@ def test_sockets_scatter_about_their_mean():
     assert found.distance == pytest.approx([abs(np.linalg.norm(means[0] - means[1]) - 0.05)])
 
 
-def test_sockets_of_unknown_distance_compare_over_the_fixtures_positions():
+def test_sockets_compare_over_positions():
+    """Sockets of unknown distance compare over the fixture's positions."""
     group = np.repeat(np.arange(4), 6)
     names = ("left/0", "left/1", "right/0", "right/1")
     found = errors(CELL, [Sockets(Q, CELL.chain.joint_names, group=group, group_names=names)])
@@ -71,7 +74,8 @@ def test_sockets_of_unknown_distance_compare_over_the_fixtures_positions():
     assert errors(CELL, [alone]).distance is None
 
 
-def test_pair_errors_do_not_know_where_the_station_stands():
+def test_pair_errors_ignore_the_station():
+    """Pair errors do not know where the station stands."""
     seen = EXACT[:, :3, 3] + 1e-3 * np.random.default_rng(1).standard_normal((24, 3))
     measured = [block("position", position=seen)]
     moved = replace(CELL, stations=from_xyz_rpy([[5.0, 0.0, 0.0]], [[1.0, 1.0, 1.0]]))
@@ -81,7 +85,8 @@ def test_pair_errors_do_not_know_where_the_station_stands():
     assert here.max() > 1e-4
 
 
-def test_pairs_are_sampled_by_seed_and_never_a_row_with_itself():
+def test_pairs_are_sampled_by_seed():
+    """Pairs are sampled by seed, and never a row with itself."""
     measured = [block("position", position=EXACT[:, :3, 3] + 1.0 * np.random.default_rng(1).standard_normal((24, 3)))]
     some = pair_errors(CELL, measured, limit=50, seed=1)
     assert len(some) == 50

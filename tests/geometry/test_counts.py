@@ -65,13 +65,15 @@ def test_with_general_frames(name, kind, rank):
 
 
 @pytest.mark.parametrize("name, rank", [("lwr4plus", 29), ("ur5", 25)])
-def test_a_target_on_the_last_axis_tells_two_fewer(name, rank):
+def test_target_on_last_axis_tells_two_fewer(name, rank):
+    """A target on the last axis tells two fewer."""
     found = split(on_axis(cell(ROBOTS[name](), 2)), "position")
     assert found.rank == rank and found.gap > 1e6
 
 
 @pytest.mark.parametrize("name, lost", [("ur5", 2), ("scara", 3)])
-def test_without_hayatis_beta_parallel_axes_cannot_tilt(name, lost):
+def test_parallel_axes_need_beta_to_tilt(name, lost):
+    """Without Hayati's beta parallel axes cannot tilt."""
     chain = ROBOTS[name]()
     assert split(cell(without_beta(chain), 2)).rank == split(cell(chain, 2)).rank - lost
 
@@ -81,7 +83,7 @@ def test_ur5_without_beta_is_28():
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_general_geometry_has_the_same_count_as_the_nominal(name):
+def test_general_geometry_has_nominal_count(name):
     """4R + 2P + 6 does not depend on the axes being parallel or crossing; without β it is reached off the parallels."""
     chain = ROBOTS[name]()
     count = sum(4 if joint.kind == "revolute" else 2 for joint in chain.joints) + 6
@@ -91,7 +93,7 @@ def test_general_geometry_has_the_same_count_as_the_nominal(name):
 
 
 @pytest.mark.parametrize("kind, ranks", [("pose", (34, 30, 20)), ("position", (31, 27, None))])
-def test_six_elements_per_joint_tell_the_same(kind, ranks, tmp_path):
+def test_six_elements_tell_the_same(kind, ranks, tmp_path):
     """An MDH table and a URDF of the same arm: other parameters, the same count."""
     for name, rank in zip(ROBOTS, ranks):
         table = ROBOTS[name]()
@@ -104,7 +106,8 @@ def test_six_elements_per_joint_tell_the_same(kind, ranks, tmp_path):
         assert found.gap > 1e6
 
 
-def test_both_descriptions_span_the_same_space(tmp_path):
+def test_both_descriptions_span_same_space(tmp_path):
+    """Both descriptions span the same space."""
     table = load("ur5")
     (tmp_path / "ur5.urdf").write_text(urdf_write.write_new(table))
     other = urdf.read(tmp_path / "ur5.urdf", table.base, table.tip)
@@ -157,7 +160,7 @@ def test_the_papers_nine_rows(tool, tolerance, rank):
     assert split(installation, candidates=candidates, tolerance=tolerance, count=200).rank == rank
 
 
-def test_the_papers_choice_of_what_to_drop_leaves_a_well_conditioned_matrix():
+def test_papers_choice_is_well_conditioned():
     """Without alpha0, d0, theta7, r7 the 32 columns are independent (facts, 2.1); with theta7 they hardly are."""
     installation = paper_form(lwr4plus.table_2()[0])
     table = layout(installation)
@@ -169,7 +172,7 @@ def test_the_papers_choice_of_what_to_drop_leaves_a_well_conditioned_matrix():
     assert np.linalg.cond(observation_matrix(installation, blocks, with_theta7)) > 100 * np.linalg.cond(matrix)
 
 
-def test_frames_are_preferred_to_the_arm_and_offsets_to_lengths():
+def test_frames_and_offsets_are_preferred():
     """What the first joint's placement and the base have in common stays with the base."""
     installation = cell(load("ur5"), 2)
     table = layout(installation)
@@ -180,7 +183,7 @@ def test_frames_are_preferred_to_the_arm_and_offsets_to_lengths():
     assert {"beta3", "beta4"} <= kept and not {"r2", "r3"} <= kept
 
 
-def test_off_the_parallel_hayatis_beta_wins_over_the_offset_that_blows_up():
+def test_hayati_beta_wins_off_the_parallel():
     """On the arm as it really is alpha, d, beta, r, theta are one too many: r, ill defined there, stays at nominal."""
     installation = cell(perturb(load("ur5"), 5, 1e-3, 2e-3), 2)
     found = split(installation, tolerance=1e-9)
@@ -189,7 +192,8 @@ def test_off_the_parallel_hayatis_beta_wins_over_the_offset_that_blows_up():
     assert {"beta3", "beta4"} <= kept and not {"r2", "r3", "r4"} <= kept
 
 
-def test_poses_that_hold_the_wrist_still_tell_fewer():
+def test_still_wrist_tells_fewer():
+    """Poses that hold the wrist still tell fewer."""
     installation = cell(load("ur5"), 2)
     q = random_joints(installation.chain, 60, 0)
     q[:, 3:] = 0.3
@@ -198,7 +202,8 @@ def test_poses_that_hold_the_wrist_still_tell_fewer():
     assert found.rank == 4 * 3 + 6 and found.gap > 1e6  # an arm of three joints
 
 
-def test_distances_say_nothing_of_the_station():
+def test_distances_ignore_the_station():
+    """Distances say nothing of the station."""
     installation = cell(load("ur5"), 2)
     found = split(installation, "distance", count=200)
     names = layout(installation).names

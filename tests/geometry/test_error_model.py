@@ -43,7 +43,7 @@ def found() -> tuple[ErrorModel, Installation]:
 
 
 @pytest.mark.parametrize("reach", [1.2, 1.6, 2.4])
-def test_95_of_100_unseen_errors_are_within_the_interval_near_and_far(found, reach):
+def test_interval_covers_95_of_100_errors(found, reach):
     """400 errors of one cell: the coverage is known to ± 2 %; far away the interval may be wider than needed."""
     model, cell = found
     block = measured(2, 400, reach, 5e-4)
@@ -51,7 +51,8 @@ def test_95_of_100_unseen_errors_are_within_the_interval_near_and_far(found, rea
     assert 0.91 < covered < (0.99 if reach < 2.0 else 1.0)
 
 
-def test_the_covariance_of_the_parameters_alone_would_be_far_too_small(found):
+def test_parameter_covariance_is_too_small(found):
+    """The covariance of the parameters alone would be far too small."""
     model, cell = found
     block = measured(2, 400, 1.6, 5e-4)
     from calib.geometry.observation import pose_sigmas
@@ -60,7 +61,7 @@ def test_the_covariance_of_the_parameters_alone_would_be_far_too_small(found):
     assert np.mean(errors(cell, [block]).main < model.discrepancy.radius * alone) < 0.8
 
 
-def test_an_arm_that_errs_more_at_one_end_of_a_joint_is_expected_to():
+def test_uneven_error_of_joint_is_expected():
     """One interval for all poses, of 1.0 mm, held 77 % at that end and 100 % elsewhere, where the rms error is 0.24."""
 
     def uneven(seed: int, count: int) -> Positions:
@@ -76,7 +77,7 @@ def test_an_arm_that_errs_more_at_one_end_of_a_joint_is_expected_to():
     assert 0.9 < np.mean(size[end] < radius[end]) < 0.98 and np.mean(size[~end] < radius[~end]) > 0.95
 
 
-def test_intervals_learnt_from_few_poses_hold_on_average():
+def test_few_poses_give_valid_intervals():
     """16 times 24 poses: 95 ± 2 % are inside; 89 were where the quantile was that of the rows left out."""
 
     def noisy(seed: int, count: int) -> Positions:
@@ -91,7 +92,8 @@ def test_intervals_learnt_from_few_poses_hold_on_average():
     assert 0.92 < np.mean(covered) < 0.98
 
 
-def test_without_a_profile_errors_are_even_as_in_results_of_earlier_versions(found):
+def test_no_profile_means_even_errors(found):
+    """Without a profile errors are even, as in results of earlier versions."""
     model, _ = found
     even = replace(model, discrepancy=replace(model.discrepancy, profile=(), placed=None))
     still = tuple(((0.0,), (0.0,)) for _ in range(6))
@@ -99,7 +101,8 @@ def test_without_a_profile_errors_are_even_as_in_results_of_earlier_versions(fou
     assert even.position_sigma(at(model.learnt[:5])) == pytest.approx(same.position_sigma(at(model.learnt[:5])))
 
 
-def test_sigma_grows_away_from_what_was_learnt_and_extrapolation_is_named(found):
+def test_sigma_grows_and_names_extrapolation(found):
+    """Sigma grows away from what was learnt, and extrapolation is named."""
     model, _ = found
     inside, outside = model.learnt[:50], model.learnt[:50] + 1.5
     assert np.median(model.position_sigma(at(outside))) > 1.5 * np.median(model.position_sigma(at(inside)))
@@ -107,7 +110,7 @@ def test_sigma_grows_away_from_what_was_learnt_and_extrapolation_is_named(found)
     assert error_model.outside(outside, model.learnt).any(axis=1).all()
 
 
-def test_beyond_an_end_that_erred_more_when_left_out_intervals_are_wider():
+def test_intervals_widen_beyond_a_bad_end():
     """Errors three times as large at one joint's lower end; planted rows, so that nothing else differs."""
     rng = np.random.default_rng(0)
     q, size = rng.uniform(-1.0, 1.0, (1000, 2)), rng.standard_normal((1000, 3))
@@ -123,7 +126,8 @@ def test_beyond_an_end_that_erred_more_when_left_out_intervals_are_wider():
     assert low > 1.5 * max(high, *others) and min(high, *others) >= 1.0
 
 
-def test_outside_a_range_the_interval_grows_by_its_end_and_not_where_frames_are_placed_anew(found):
+def test_interval_grows_by_end_of_range(found):
+    """Outside a range the interval grows by its end, and not where frames are placed anew."""
     model, cell = found
     ends = tuple((2.0, 1.0) if j == 0 else (1.0, 1.0) for j in range(6))
     wide, plain = (replace(model, discrepancy=replace(model.discrepancy, wider=each)) for each in (ends, ()))
@@ -136,7 +140,8 @@ def test_outside_a_range_the_interval_grows_by_its_end_and_not_where_frames_are_
     assert anew[0] == pytest.approx(anew[1])
 
 
-def test_without_positions_or_with_few_nothing_is_expected(found):
+def test_few_or_no_positions_expect_nothing(found):
+    """Without positions, or with few, nothing is expected."""
     block = measured(1, 19, 1.6, 0.0)
     selected = select_model(install(load("ur5"), [block]), [block], "frames")
     assert learn_errors(selected, [block]) is None
@@ -149,7 +154,8 @@ def drawn(loud: float, count: int = 300) -> tuple[np.ndarray, np.ndarray]:
     return q, np.where(q[:, 0] > 1.0, loud**2, 1.0) * rng.chisquare(3, count) / 3.0
 
 
-def test_it_finds_the_joint_and_the_end_where_errors_are_ten_times_larger():
+def test_bad_joint_and_end_are_found():
+    """The model finds the joint and the end where errors are ten times larger."""
     q, squares = drawn(10.0)
     profile = Unevenness(q, squares).profile()
     s = unevenness(profile, np.array([[-1.0, 0.0, 0.3], [1.6, 0.0, 0.3]]))
@@ -162,7 +168,8 @@ def test_even_errors_have_no_profile():
     assert np.allclose(unevenness(Unevenness(q, squares).profile(), q), 1.0, atol=0.25)
 
 
-def test_copies_of_few_poses_tell_nothing_impossible():
+def test_copies_tell_nothing_impossible():
+    """Copies of few poses tell nothing impossible."""
     q, squares = drawn(10.0)
     few = np.arange(40) % 4
     profile = Unevenness(q[few], squares[few]).profile(np.arange(40) < 8)
@@ -170,7 +177,7 @@ def test_copies_of_few_poses_tell_nothing_impossible():
     assert np.allclose(unevenness(Unevenness(q, np.ones(len(q))).profile(), q), 1.0, atol=0.01)
 
 
-def test_without_the_poses_of_an_end_more_is_expected_there_than_in_the_middle():
+def test_missing_end_is_expected_worse():
     """The loud end is not known then; that the joint is uneven is (its other end is loud, too)."""
     q, squares = drawn(1.0)
     squares = squares * np.where(np.abs(q[:, 0]) > 1.0, 25.0, 1.0)

@@ -23,7 +23,8 @@ def apart(a: np.ndarray, b: np.ndarray) -> float:
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("name", ["lwr4plus", "ur5"])
-def test_poses_without_noise_give_station_and_tool_exactly(name, seed):
+def test_exact_poses_give_station_and_tool(name, seed):
+    """Poses without noise give station and tool exactly."""
     truth = cell(load(name), seed)
     guess = install(truth.chain, [measure(truth, "pose", 12, seed)])
     assert apart(guess.stations, truth.stations) < 1e-9
@@ -32,20 +33,22 @@ def test_poses_without_noise_give_station_and_tool_exactly(name, seed):
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("name", ["lwr4plus", "ur5"])
-def test_positions_without_noise_give_station_and_offset_exactly(name, seed):
+def test_exact_positions_give_station(name, seed):
+    """Positions without noise give station and offset exactly."""
     truth = cell(load(name), seed)
     guess = install(truth.chain, [measure(truth, "position", 15, seed)])
     assert apart(guess.stations, truth.stations) < 1e-9
     assert guess.tools[0, :3, 3] == pytest.approx(truth.tools[0, :3, 3], abs=1e-9)
 
 
-def test_sockets_without_noise_give_the_offset_exactly():
+def test_exact_sockets_give_offset():
+    """Sockets without noise give the offset exactly."""
     truth = cell(load("lwr4plus"), 1)
     guess = install(truth.chain, [measure(truth, "sockets", 36, 2)])
     assert guess.tools[0, :3, 3] == pytest.approx(truth.tools[0, :3, 3], abs=1e-8)
 
 
-def test_several_reflectors_and_stations_of_different_kinds():
+def test_several_reflectors_and_stations():
     """Poses of one tool at the first station, positions of two others at the second."""
     truth = cell(load("ur5"), 3, ("camera", "tracker"), ("marker", "ball", "cube"))
     blocks = [measure(truth, "pose", 15, 1), measure(truth, "position", 30, 2, station=1, tools=(1, 2))]
@@ -55,7 +58,8 @@ def test_several_reflectors_and_stations_of_different_kinds():
     assert guess.tools[:, :3, 3] == pytest.approx(truth.tools[:, :3, 3], abs=1e-9)
 
 
-def test_one_reflector_seen_from_two_stations():
+def test_reflector_seen_from_two_stations():
+    """One reflector seen from two stations."""
     truth = cell(load("ur5"), 4, ("a", "b"))
     blocks = [measure(truth, "position", 20, 1), measure(truth, "position", 8, 2, station=1)]
     guess = install(truth.chain, blocks)
@@ -81,7 +85,8 @@ def weighed_alike(found, judge) -> float:
 
 @pytest.mark.parametrize("seeds", [[0], pytest.param([1, 2], marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["pose", "position", "sockets"])
-def test_with_arm_errors_of_millimetres_it_leads_to_the_best_of_many_random_starts(kind, seeds):
+def test_guess_leads_to_best_of_many_starts(kind, seeds):
+    """With arm errors of millimetres the guess leads to the best of many random starts."""
     for seed in seeds:
         nominal, truth, off = arm_off(seed)
         assert 1.5e-3 < off < 9e-3
@@ -103,7 +108,8 @@ def test_with_arm_errors_of_millimetres_it_leads_to_the_best_of_many_random_star
 
 @pytest.mark.parametrize("kind", ["pose", "position"])
 @pytest.mark.parametrize("seed", range(4))
-def test_a_fifth_of_outliers_does_not_matter_with_a_robust_loss(kind, seed):
+def test_robust_loss_ignores_outliers(kind, seed):
+    """A fifth of outliers does not matter with a robust loss."""
     nominal, truth, _ = arm_off(seed)
     clean = measure(truth, kind, 60, seed, sigma=5e-5, stated=False)
     rng = np.random.default_rng(seed)
@@ -122,7 +128,8 @@ def test_a_fifth_of_outliers_does_not_matter_with_a_robust_loss(kind, seed):
     assert position_error(plain.cell, ideal.cell, q).max() > 10 * between  # without it they do matter
 
 
-def test_the_mean_of_poses_is_on_the_group_and_ignores_one_wild_position():
+def test_mean_pose_ignores_a_wild_position():
+    """The mean of poses is on the group and ignores one wild position."""
     poses = frames(1, 0, 1.0) @ pose(None, 1e-6 * np.random.default_rng(0).normal(size=(9, 3)))
     poses[4, :3, 3] += 10.0
     mean = average_pose(poses)
@@ -138,7 +145,8 @@ def test_too_few_rows_are_refused_in_words(kind, count):
         install(truth.chain, [measured])
 
 
-def test_positions_on_a_line_are_refused_and_radians_under_degrees_named():
+def test_positions_on_a_line_are_refused():
+    """Positions on a line are refused, and radians under degrees named."""
     truth = cell(load("ur5"), 1)
     block = measure(truth, "position", 30, 1)
     line = np.outer(np.linspace(0.0, 1.0, len(block)), [0.3, 0.4, 0.5])

@@ -34,7 +34,8 @@ def parted(measured, kind: str, count: int | None = None) -> Folds:
 
 
 @pytest.mark.parametrize("count", [30, 60, 300, 1000])
-def test_regions_are_a_partition_of_any_size_and_none_dominates(truth, count):
+def test_regions_are_balanced_partition(truth, count):
+    """Regions are a partition of any size, and none dominates."""
     folds = parted([measure(truth, "position", count, 1)], "regions")
     assert np.bincount(folds.members[0]).max() < (0.7 if count < 60 else 0.4) * count
 
@@ -57,7 +58,8 @@ def test_the_seed_repeats_the_regions(truth):
     assert np.array_equal(one, same) and not np.array_equal(one, other)
 
 
-def test_stations_are_kept_whole_each_in_a_fold_of_its_own(truth):
+def test_stations_are_kept_whole(truth):
+    """Stations are kept whole, each in a fold of its own."""
     measured = [measure(truth, "position", 20 + 5 * k, k, station=k) for k in range(3)]
     measured.append(replace(measure(truth, "pose", 15, 9, station=1), file="again"))
     folds = parted(measured, "stations", 3)
@@ -66,7 +68,8 @@ def test_stations_are_kept_whole_each_in_a_fold_of_its_own(truth):
     assert first[1] == first[3] and len(set(first[:3])) == 3
 
 
-def test_one_station_or_fixture_cannot_be_left_out_so_regions_are(truth):
+def test_lone_station_is_split_by_regions(truth):
+    """One station or fixture cannot be left out, so regions are."""
     parted([measure(truth, "position", 40, 1), measure(truth, "pose", 40, 2)], "regions")
     parted([sockets(1)], "regions")
 
@@ -75,7 +78,8 @@ def assert_pairs_together(folds: Folds, block) -> None:
     assert all(len(set(folds.members[0][block.group == pair])) == 1 for pair in np.unique(block.group))
 
 
-def test_the_two_rows_of_a_distance_stay_together(truth):
+def test_rows_of_a_distance_stay_together(truth):
+    """The two rows of a distance stay together."""
     measured = [measure(truth, "distance", 120, 1), measure(truth, "position", 50, 2)]
     measured[0] = take(measured[0], np.random.default_rng(0).permutation(120))
     assert_pairs_together(parted(measured, "regions"), measured[0])
@@ -90,24 +94,28 @@ def sockets(fixtures: int, file: str = "one", linked: bool = True) -> PoseMeasur
 
 
 @pytest.mark.parametrize("fixtures", [3, 5, 8])
-def test_fixtures_stay_whole_with_both_sockets_of_a_known_distance(fixtures):
+def test_fixtures_stay_whole(fixtures):
+    """Fixtures stay whole, with both sockets of a known distance."""
     measured = sockets(fixtures)
     folds = parted([measured], "fixtures", min(fixtures, 5))
     for k in range(fixtures):
         assert len(set(folds.members[0][np.isin(measured.group, [2 * k, 2 * k + 1])])) == 1
 
 
-def test_sockets_without_links_are_left_out_one_by_one():
+def test_lone_sockets_are_left_out_singly():
+    """Sockets without links are left out one by one."""
     parted([sockets(2, linked=False)], "fixtures", 4)
 
 
-def test_files_without_an_instrument_are_left_out_one_by_one():
+def test_files_are_left_out_one_by_one():
+    """Files without an instrument are left out one by one."""
     folds = parted([sockets(2, name) for name in "xyz"], "files", 3)
     assert all(len(set(members)) == 1 for members in folds.members)
 
 
 @pytest.mark.parametrize("kind", ["position", "distance"])
-def test_random_folds_are_a_partition_that_the_seed_repeats(truth, kind):
+def test_random_folds_repeat_by_seed(truth, kind):
+    """Random folds are a partition that the seed repeats."""
     measured = [measure(truth, kind, 60, 1)]
     folds = random_folds(measured, 10, seed=3)
     assert_partition(folds, measured)
@@ -118,7 +126,8 @@ def test_random_folds_are_a_partition_that_the_seed_repeats(truth, kind):
         assert_pairs_together(folds, measured[0])
 
 
-def test_leaving_out_one_pose_leaves_out_each_once_and_only_of_few(truth):
+def test_single_poses_are_left_out_of_few(truth):
+    """Leaving out one pose leaves out each once, and only of few."""
     measured = [measure(truth, "position", 40, 1)]
     folds = folds_by_name("poses", measured)
     assert folds.count == 40 and sorted(folds.members[0]) == list(range(40))

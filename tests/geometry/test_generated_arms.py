@@ -31,7 +31,7 @@ def measured(text: str, count: int, seed: int) -> tuple[Arm, np.ndarray, Targets
 
 @given(text=arms())
 @settings(max_examples=10)
-def test_the_plain_reference_recovers_generated_arms(text: str):
+def test_plain_reference_recovers_arms(text: str):
     """So that a fit which does not has no excuse."""
     nominal, q, targets, truth = measured(text, CONDITIONS.poses, zlib.crc32(text.encode()))
     cell = plain_map.fit(plain_map.placed(Chain.of(nominal), q, targets), q, targets)
@@ -55,7 +55,7 @@ def test_the_plain_references_jacobian(text: str):
 @pytest.mark.slow
 @given(text=arms())
 @settings(max_examples=12, phases=[Phase.generate])  # seconds each: shrinking would take hours
-def test_the_default_fit_recovers_generated_arms(tmp_path_factory: pytest.TempPathFactory, text: str):
+def test_default_fit_recovers_arms(tmp_path_factory: pytest.TempPathFactory, text: str):
     """The exported URDF is held against the truth by Pinocchio, and the tool in tool0 where the arm has one."""
     source = Path(tmp_path_factory.mktemp("generated")) / f"arm{zlib.crc32(text.encode())}.urdf"
     source.write_text(text)

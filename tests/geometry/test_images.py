@@ -59,7 +59,7 @@ def fitted(cell, block, *others, **more):
 @pytest.mark.parametrize(
     "lens", [camera.FIVE_MEGAPIXEL, pytest.param(FISHEYE, marks=pytest.mark.slow)], ids=["pinhole", "fisheye"]
 )
-def test_the_residuals_slope_is_minus_the_jacobian(mounting, lens):
+def test_residual_slope_is_minus_jacobian(mounting, lens):
     """Arm, both placements, every value of the lens, scale and bending; some corners unseen; away from the truth."""
     arm = Cell(load("ur5"), replace(virtual_cell("ur5").truth, deflection=Deflection()))
     cell = camera.camera_cell(arm, mounting, lens=lens, shape=BoardShape(1.01, 0.1, -0.2, 0.3))
@@ -85,7 +85,7 @@ def test_the_residuals_slope_is_minus_the_jacobian(mounting, lens):
     assert residual @ residual == pytest.approx(values @ values, rel=1e-12)
 
 
-def test_whitening_by_what_an_image_shares_is_that_of_the_full_covariance():
+def test_whitening_is_of_full_covariance():
     """Rᵀ R of the reduced rows equals Jᵀ (f² σ² I + G S Gᵀ)⁻¹ J over all corners of an image."""
     cell, block = study(count=6)
     block, start, candidates = started(cell, block)
@@ -108,7 +108,8 @@ def test_whitening_by_what_an_image_shares_is_that_of_the_full_covariance():
 
 
 @pytest.mark.parametrize("mounting", [IN_HAND, pytest.param(TO_HAND, marks=pytest.mark.slow)])
-def test_the_arm_is_recovered_with_lens_and_mounting_found(mounting):
+def test_arm_lens_and_mounting_recovered(mounting):
+    """The arm is recovered, with lens and mounting found."""
     cell, block = study(mounting)
     block, found = fitted(cell, block)
     assert block.mounting == mounting
@@ -132,7 +133,7 @@ def test_a_lens_that_was_given_stays():
 
 
 @pytest.mark.slow
-def test_a_print_of_another_size_is_measured_beside_another_instrument():
+def test_print_of_another_size_is_measured():
     """Board scale and bending are fitted where tracker points tell the scale; pixels and points in one fit."""
     plain, _ = study()
     shape = BoardShape(1.002, 0.05, 0.0, -0.04)
@@ -172,7 +173,8 @@ def test_two_cameras_see_one_board():
     assert position_errors(cell.cell, own, found.cell.chain)[2] < 0.03
 
 
-def test_corners_that_are_detected_worse_than_stated_are_said():
+def test_worse_corners_are_said():
+    """Corners that are detected worse than stated are said."""
     cell, block = study()
     _, found = fitted(cell, replace(block, sigma=0.1 * block.sigma))
     (one,) = [one for one in image_notes(found) if one.code == "corners-off"]
@@ -180,7 +182,7 @@ def test_corners_that_are_detected_worse_than_stated_are_said():
 
 
 @pytest.mark.slow
-def test_what_an_arm_does_not_repeat_is_told_from_what_a_corner_does_not():
+def test_arm_noise_is_told_from_corners():
     """Encoders of 0.1 mrad before corners of 0.05 px: the fit finds both, and its sigmas are those of the arm."""
     cell, block = study(count=60, encoder=1e-4)
     _, found = fitted(cell, block)
@@ -191,7 +193,8 @@ def test_what_an_arm_does_not_repeat_is_told_from_what_a_corner_does_not():
 
 
 @pytest.mark.slow
-def test_bad_corners_and_images_are_named_and_do_little_harm():
+def test_bad_corners_and_images_are_named():
+    """Bad corners and images are named and do little harm."""
     cell, block = study()
     block, start, candidates = started(cell, replace(block, lens=cell.lens))
     pixel = block.pixel.copy()
@@ -207,7 +210,7 @@ def test_bad_corners_and_images_are_named_and_do_little_harm():
     assert position_errors(cell.cell, found.cell, found.cell.chain)[1] < 0.08
 
 
-def test_a_gross_corner_and_images_that_contradict_all_others_are_left_out_and_named():
+def test_gross_corners_and_images_left_out():
     """Without a robust loss, too: one corner that is another one's, images turned by a program, joints exchanged."""
     cell, block = study()
     pixel, q = block.pixel.copy(), block.q.copy()
@@ -223,7 +226,8 @@ def test_a_gross_corner_and_images_that_contradict_all_others_are_left_out_and_n
 
 
 @pytest.mark.slow
-def test_without_images_that_contradict_all_others_the_fit_is_good_and_half_of_them_are_too_many():
+def test_half_contradicting_is_too_many():
+    """Without images that contradict all others the fit is good, and half of them are too many."""
     cell, block = study()
     q = block.q.copy()
     q[[20, 30]] = q[[30, 20]]
@@ -236,7 +240,7 @@ def test_without_images_that_contradict_all_others_the_fit_is_good_and_half_of_t
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
-def test_the_noise_of_images_settles_wherever_the_camera_stands(seed):
+def test_noise_of_images_settles(seed):
     """Far boards of small images: what an image is off by shrinks slowly from fit to fit; planted are encoders only."""
     cell = camera.camera_cell(rigid(virtual_cell("lwr4plus")), TO_HAND, lens=camera.DEMO_LENS, reach_of_arm=0.75)
     block = camera.photograph(cell, camera.views(cell, 30, seed, camera.Views((0.25, 0.6))), 0.03, seed)
@@ -257,14 +261,16 @@ def test_rows_shifted_by_one_are_said_to_be():
         complete_camera(cell.cell.nominal, mixed)
 
 
-def test_a_board_of_another_square_is_refused_with_its_size():
+def test_board_of_other_square_is_refused():
+    """A board of another square is refused with its size."""
     cell, block = study()
     wrong = replace(block, board=replace(block.board, square=0.025, marker=0.0175))
     with pytest.raises(MeasurementError, match=r"square of the board is (29\.\d|30\.\d).* 25.00 in board.toml"):
         complete_camera(cell.cell.nominal, wrong)
 
 
-def test_images_from_one_direction_do_not_tell_the_focal_length():
+def test_one_direction_hides_focal_length():
+    """Images from one direction do not tell the focal length."""
     cell, _ = study()
     q = camera.views(cell, 12, 0, camera.Views((0.35, 0.4), 0.01))
     with pytest.raises(MeasurementError, match=r"focal length is identified .* tilt it"):
@@ -274,7 +280,7 @@ def test_images_from_one_direction_do_not_tell_the_focal_length():
 
 
 @pytest.mark.slow
-def test_a_flat_board_has_one_pose_even_from_afar():
+def test_distant_flat_board_has_one_pose():
     """Both poses that a distant plane may have are tried."""
     cell, _ = study(TO_HAND)
     q = camera.views(cell, 60, 5, camera.Views((0.6, 0.6), 0.5))
@@ -287,7 +293,8 @@ def test_a_flat_board_has_one_pose_even_from_afar():
 
 
 @pytest.mark.parametrize("method", ["Shah", "Li", "Park-Martin"])
-def test_every_closed_form_places_exact_poses(method, monkeypatch):
+def test_closed_forms_place_exact_poses(method, monkeypatch):
+    """Every closed form places exact poses."""
     from calib.geometry.camera import robust_placement as robust
     from calib.geometry.first_guess import place_pose
 
@@ -301,7 +308,8 @@ def test_every_closed_form_places_exact_poses(method, monkeypatch):
 
 
 @pytest.mark.slow
-def test_frames_of_unseen_images_are_placed_with_the_lens_of_the_fit():
+def test_unseen_frames_use_the_fitted_lens():
+    """Frames of unseen images are placed with the lens of the fit."""
     cell, block = study()
     block, found = fitted(cell, block)
     later = camera.photograph(cell, camera.views(cell, 15, 8), 0.05, 8)

@@ -33,7 +33,8 @@ def joints(goal: Goal, count: int, seed: int, share: float = 0.8) -> np.ndarray:
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_poses_of_the_deflected_arm_are_found_again(robot):
+def test_poses_of_deflected_arm_are_found(robot):
+    """Poses of the deflected arm are found again."""
     goal = arm(robot)
     q = joints(goal, 200, 1)
     targets = inverse.seen_at(goal, q).poses()
@@ -46,7 +47,7 @@ def test_poses_of_the_deflected_arm_are_found_again(robot):
 
 
 @pytest.mark.parametrize("dof", [6, 5, 3])
-def test_the_jacobian_is_the_slope_of_the_differences(dof):
+def test_jacobian_is_slope_of_differences(dof):
     """Of a rigid arm exactly: what it leaves out are the deflections' own slopes."""
     goal = replace(arm("panda", dof), cell=rigid(lwr4plus_cell()).truth)
     q = joints(goal, 5, 4)
@@ -55,7 +56,8 @@ def test_the_jacobian_is_the_slope_of_the_differences(dof):
         check(lambda x, target=target: -inverse.differences(goal, x[None], target[None])[0], claimed, one)
 
 
-def test_a_turned_tool_meets_a_target_that_leaves_the_turn_free():
+def test_turned_tool_meets_a_free_turn():
+    """A turned tool meets a target that leaves the turn free."""
     goal = arm("ur5", 5)
     q = joints(goal, 50, 5)
     targets = inverse.seen_at(goal, q).poses()
@@ -68,7 +70,7 @@ def test_a_turned_tool_meets_a_target_that_leaves_the_turn_free():
 
 
 @pytest.mark.parametrize(("robot", "dof"), [("lwr4plus", 6), ("ur5", 3), ("ur5", 5)])
-def test_redundant_joints_stay_nearest_to_the_start(robot, dof):
+def test_redundant_joints_stay_near_start(robot, dof):
     """First-order optimality: what is left of q - q_start lies in the rows of the Jacobian."""
     goal = arm(robot, dof)
     q = joints(goal, 50, 6, 0.6)
@@ -82,7 +84,8 @@ def test_redundant_joints_stay_nearest_to_the_start(robot, dof):
         assert np.linalg.norm(across) < 0.02 * np.linalg.norm(change)
 
 
-def test_a_joint_at_its_limit_is_held_and_the_others_do_what_they_can():
+def test_joint_at_limit_is_held():
+    """A joint at its limit is held, and the others do what they can."""
     goal = arm("lwr4plus")
     q = joints(goal, 40, 8)
     targets = inverse.seen_at(goal, q).poses()
@@ -98,7 +101,8 @@ def test_a_joint_at_its_limit_is_held_and_the_others_do_what_they_can():
     assert np.delete(left, few).max() < 1e-9
 
 
-def test_near_a_singularity_no_joint_runs_away():
+def test_no_joint_runs_away_near_singularity():
+    """Near a singularity no joint runs away."""
     goal = arm("ur5")
     q = joints(goal, 30, 9)
     q[:, 4] = 1e-4  # wrist: axes 4 and 6 parallel

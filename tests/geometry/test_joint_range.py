@@ -29,7 +29,7 @@ def fitted(wide: float, seed: int, rows: int = 60):
 
 
 @pytest.mark.parametrize("wide", [0.25, 0.5, 1.0, 3.0])
-def test_sigma_over_the_range_is_the_error_there(wide):
+def test_sigma_over_range_is_the_error(wide):
     """Rms over seeds: one arm's error varies."""
     q = random_joints(load("ur5"), 300, 1)
     errors, sigmas = [], []
@@ -45,7 +45,8 @@ def levels(held: JointRange, tolerance: float | None) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("tolerance", [None, 3e-4])
-def test_one_corner_is_marginal_and_the_whole_range_is_not(tolerance):
+def test_one_corner_is_marginal(tolerance):
+    """One corner is marginal, and the whole range is not."""
     small, wide = (joint_range(*fitted(each, 5)[:2]) for each in (0.1, 3.0))
     assert levels(small, tolerance) == {"measured-range": "note", "small-range": "marginal"}
     assert levels(wide, tolerance) == {"measured-range": "note", "small-range": ""}
@@ -53,7 +54,7 @@ def test_one_corner_is_marginal_and_the_whole_range_is_not(tolerance):
     np.testing.assert_allclose([small.lower, small.upper], [MIDDLE - 0.1, MIDDLE + 0.1], atol=0.02)
 
 
-def test_a_joint_that_stood_counts_where_it_stood():
+def test_still_joint_counts_where_it_stood():
     """Locked axes of redundant arms and external axes that are not used."""
     found, start, _ = fitted(3.0, 6)
     (block,) = (each.measured for each in found.blocks)

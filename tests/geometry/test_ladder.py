@@ -55,7 +55,8 @@ def unseen(found, truth: Installation, known: bool) -> float:
     [("ur5", "position", 150), ("lwr4plus", "pose", 120), pytest.param("ur5", "pose", 600, marks=pytest.mark.slow)],
 )
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
-def test_a_rigid_truth_gives_the_geometry_and_no_effect(robot, kind, count, seed):
+def test_rigid_truth_shows_no_effect(robot, kind, count, seed):
+    """A rigid truth gives the geometry and no effect."""
     truth = rigid(robot, seed)
     measured = measure(truth, kind, count, seed, sigma=SIGMA, sigma_rotation=1e-4)
     found = climb(load(robot), measured)
@@ -76,7 +77,7 @@ def test_an_arm_that_is_its_nominal_stays_so():
     assert unseen(found.fit, truth, False) < 1.3 * SIGMA * np.sqrt(found.fit.identified / 150)
 
 
-def test_joint_offsets_cost_no_more_than_their_geometry():
+def test_offsets_cost_no_more_than_geometry():
     """Where only the offsets are wrong the full geometry finds that, to its noise."""
     nominal = load("ur5")
     moving = [nominal.names[k] for k in nominal.moving]
@@ -133,7 +134,8 @@ def test_planted_harmonics_are_found(seed):
     assert fitted[f"theta1 sin 11 {joints[0]}"] == pytest.approx(2e-4, rel=0.25)
 
 
-def test_the_last_rung_kept_is_the_one_chosen_and_each_kept_rung_is_better():
+def test_last_kept_rung_is_chosen():
+    """The last rung kept is the one chosen, and each kept rung is better."""
     found, _ = climbed(0)
     kept = [rung for rung in found.rungs if rung.kept]
     assert np.all(np.diff([rung.cross_validated for rung in kept]) < 0)
@@ -162,7 +164,8 @@ def test_what_is_fixed_stays_at_its_nominal():
     assert not np.isin(fixed, found.fit.free).any()
 
 
-def test_an_unknown_model_is_refused_with_the_list():
+def test_unknown_model_is_refused_with_list():
+    """An unknown model is refused with the list."""
     truth = rigid("ur5", 3)
     measured = measure(truth, "position", 40, 1, sigma=SIGMA)
     with pytest.raises(UsageError, match="harmonics"):

@@ -37,7 +37,8 @@ def climbed(measured, loss: str) -> ModelSelection:
 
 
 @pytest.mark.parametrize("kind, loss, sigmas", [("position", "none", 0.02), ("pose", "cauchy", 0.2)])
-def test_pieces_and_a_warm_start_change_nothing(kind, loss, sigmas, monkeypatch):
+def test_pieces_and_warm_start_agree(kind, loss, sigmas, monkeypatch):
+    """Pieces and a warm start change nothing."""
     measured = measured_arm(kind, loss)
     whole = climbed(measured, loss)
     sizes, pairs = errors(whole.fit.cell, [measured]), pair_errors(whole.fit.cell, [measured])
@@ -64,7 +65,7 @@ def test_pieces_and_a_warm_start_change_nothing(kind, loss, sigmas, monkeypatch)
 
 
 @pytest.mark.parametrize("kind", ["position", "pose"])
-def test_statistics_element_by_element_are_those_of_the_rows(kind, monkeypatch):
+def test_elementwise_statistics_match_rows(kind, monkeypatch):
     """Beside frames and lengths: harmonics of three joints, more than `MANY` corrections of two of them."""
     arm, offered = load("ur5"), EFFECTS["harmonics"](load("ur5"), False)
     elements, few = dict.fromkeys(term.element for term in offered), (MANY + 2, MANY + 5, MANY - 20)

@@ -50,7 +50,8 @@ def heights(truth: Installation, count: int, seed: int) -> Heights:
     return Heights(q, truth.chain.joint_names, see(truth, q).point[2] + noise, sigma=np.full(count, 1e-5))
 
 
-def test_a_dial_gauge_is_fitted_like_any_other_kind():
+def test_dial_gauge_is_fitted_like_any_kind():
+    """A dial gauge is fitted like any other kind."""
     nominal = load("ur5")
     truth = planted.cell(planted.perturb(nominal, 2), 2)
     start = replace(truth, chain=nominal)
@@ -63,12 +64,13 @@ def test_a_dial_gauge_is_fitted_like_any_other_kind():
     assert found.estimate.residual_std == pytest.approx(1.0, abs=0.2)
 
 
-def test_rows_are_taken_with_all_that_belongs_to_them():
+def test_rows_are_taken_with_their_parts():
+    """Rows are taken with all that belongs to them."""
     block = heights(planted.cell(load("ur5")), 10, 0)
     some = take(block, [7, 2])
     assert isinstance(some, Heights) and some.rows.tolist() == [8, 3]
     assert np.array_equal(some.height, block.height[[7, 2]]) and some.sigma is not None and len(some.sigma) == 2
-    with pytest.raises(MeasurementError, match="height has 3 rows, q has 10"):
+    with pytest.raises(MeasurementError, match="height has 3 rows, but q has 10"):
         replace(block, height=np.zeros(3))
 
 

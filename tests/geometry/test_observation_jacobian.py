@@ -92,7 +92,7 @@ def residuals(truth, block, x, free):
     "name, kind",
     [(n, k) for n in CHAINS for k in ("pose", "position", "distance", "sockets") if (n, k) != ("mixed", "sockets")],
 )
-def test_the_residuals_slope_is_minus_the_jacobian(name, kind):
+def test_residual_slope_is_minus_jacobian(name, kind):
     """Also far from the truth: residuals of centimetres, orientation residuals of a radian and more."""
     truth = cell(CHAINS[name](), 4)
     measured = measure(truth, kind, 24, 6)
@@ -128,7 +128,7 @@ def test_orientation_residuals_of_every_size(angle):
 
 @pytest.mark.parametrize("kind", ["plane", "bar", "sockets", "distance"])
 @pytest.mark.parametrize("size", [1e-4, 1e-2])
-def test_the_gradient_of_the_cost_is_exact_with_nuisances_eliminated(kind, size):
+def test_cost_gradient_is_exact(kind, size):
     """Kaufman's Jacobian is not the slope of the residuals, but Jᵀr is the slope of half the squared cost."""
     truth = cell(load("lwr4plus"), 4)
     measured = measure(truth, kind, 48, 6)
@@ -144,7 +144,8 @@ def test_the_gradient_of_the_cost_is_exact_with_nuisances_eliminated(kind, size)
 
 
 @pytest.mark.parametrize("kind", ["plane", "bar"])
-def test_at_the_truth_kaufmans_jacobian_is_the_slope(kind):
+def test_kaufman_jacobian_is_slope_at_truth(kind):
+    """At the truth Kaufman's Jacobian is the slope."""
     truth = cell(load("lwr4plus"), 4)
     measured = measure(truth, kind, 36, 6)
     free = np.arange(len(layout(truth).names))
@@ -154,7 +155,8 @@ def test_at_the_truth_kaufmans_jacobian_is_the_slope(kind):
     check(lambda x: residuals(truth, block, x, free), -part.jacobian[:, 0].T, np.zeros(len(free)), 1e-6, 2e-5)
 
 
-def test_parameters_of_a_step_add_up_and_a_zero_step_changes_nothing():
+def test_steps_add_up_and_zero_is_neutral():
+    """Parameters of a step add up, and a zero step changes nothing."""
     truth = moving_cell("mixed", ("front", "back"))
     free = np.arange(len(layout(truth).names))
     q = random_joints(truth.chain, 3)

@@ -76,7 +76,7 @@ def calibrate(nominal, measured, settings=None):
 @pytest.mark.parametrize(
     "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in SCENES]
 )
-def test_errors_are_what_the_stated_covariance_says(name):
+def test_errors_follow_stated_covariance(name):
     """dxᵀ C⁻¹ dx / p is Fisher's F(p, dof), C being scaled by the residuals; two-sided, at four standard errors."""
     scores, squares, freedom = [], 0.0, 0
     seeds = SEEDS // 2 if name in ("sockets", "plane") else SEEDS  # touching takes inverse kinematics, hence time
@@ -96,7 +96,7 @@ def test_errors_are_what_the_stated_covariance_says(name):
 
 @pytest.mark.parametrize("robot", ["lwr4plus", "ur5"])
 @pytest.mark.parametrize("kind", ["pose", "position"])
-def test_predictions_at_unseen_joints_are_better_than_one_measurement(robot, kind):
+def test_predictions_beat_one_measurement(robot, kind):
     """Error of the prediction: sigma sqrt(p / rows), about; the nominal arm is 20 times off."""
     nominal = load(robot)
     for seed in range(3):
@@ -112,7 +112,8 @@ def test_predictions_at_unseen_joints_are_better_than_one_measurement(robot, kin
 
 
 @pytest.mark.parametrize("name", ["pose", "position", "sockets", "distance"])
-def test_without_noise_the_truth_is_found_to_rounding(name):
+def test_exact_rows_give_the_truth(name):
+    """Without noise the truth is found to rounding."""
     scene = SCENES[name][0]
     nominal = load("lwr4plus")
     measured = scene(cell(perturb(nominal, 5, 1e-3, 2e-3), 1), 1, 0.0, 1)
@@ -124,7 +125,7 @@ def test_without_noise_the_truth_is_found_to_rounding(name):
     ("name", "seeds"),
     [("position", 6), *(pytest.param(name, SEEDS, marks=pytest.mark.slow) for name in ("pose", "position"))],
 )
-def test_sigmas_that_are_not_stated_are_estimated(name, seeds):
+def test_unstated_sigmas_are_estimated(name, seeds):
     """Position and orientation each get their own, within the scatter that so many rows allow."""
     ratios = []
     for seed in range(seeds):
@@ -140,7 +141,7 @@ def test_sigmas_that_are_not_stated_are_estimated(name, seeds):
     assert np.mean(ratios, axis=0) == pytest.approx(1.0, abs=4 * 0.05 / np.sqrt(seeds))
 
 
-def test_merging_parameters_share_what_is_identified():
+def test_merging_parameters_share():
     """Base parameters are as many as ever; what displaces base or tool alone stays at nominal, the others share."""
     nominal, truth, measured, _ = planted("pose", 3)
     found = calibrate(nominal, measured)
@@ -158,7 +159,7 @@ def test_merging_parameters_share_what_is_identified():
     assert position_error(found.cell, truth, q).max() < 3 * SIGMA
 
 
-def test_the_robot_does_not_depend_on_which_of_merging_parameters_comes_first():
+def test_merging_order_does_not_matter():
     """Axis 5 is displaced along itself by a hair: joint 4's offset then moves the tool over that lever."""
     tips = []
     for lever in (0.0, 1e-4, 5e-4, 1e-2):
@@ -172,7 +173,7 @@ def test_the_robot_does_not_depend_on_which_of_merging_parameters_comes_first():
     assert max(tips) < 1.5 * SIGMA, tips
 
 
-def test_what_few_poses_hardly_tell_stays_near_its_nominal():
+def test_weakly_told_stays_near_nominal():
     """The wrist turns by a degree only: its offsets are determined on paper, with sigmas beyond what is plausible."""
     nominal = load("ur5")
     truth = cell(perturb(nominal, 1, 0.5e-3, 1e-3), 1)
@@ -190,7 +191,8 @@ def test_what_few_poses_hardly_tell_stays_near_its_nominal():
     assert near.values["names"]
 
 
-def test_equation_11_and_levenberg_marquardt_end_at_the_same_arm():
+def test_both_solvers_end_at_the_same_arm():
+    """Equation 11 and Levenberg-Marquardt end at the same arm."""
     nominal, _, measured, _ = planted("pose", 4)
     one = calibrate(nominal, measured)
     other = calibrate(nominal, measured, Settings(damping=0.0))
@@ -198,7 +200,8 @@ def test_equation_11_and_levenberg_marquardt_end_at_the_same_arm():
     assert other.estimate.values == pytest.approx(one.estimate.values, abs=1e-3 * one.estimate.sigma.max())
 
 
-def test_the_order_of_rows_and_blocks_does_not_matter():
+def test_row_order_does_not_matter():
+    """The order of rows and blocks does not matter."""
     nominal, _, measured, _ = planted("two stations", 5)
     rng = np.random.default_rng(0)
     mixed = [take(block, rng.permutation(len(block))) for block in measured[::-1]]
@@ -211,7 +214,8 @@ def test_the_order_of_rows_and_blocks_does_not_matter():
 
 
 @pytest.mark.parametrize("loss", [pytest.param("huber", marks=pytest.mark.slow), "cauchy"])
-def test_planted_outliers_are_named_with_file_and_row_and_hardly_any_others(loss):
+def test_planted_outliers_are_named(loss):
+    """Planted outliers are named with file and row, and hardly any others."""
     others = 0
     for seed in range(6):
         nominal = load("ur5")
@@ -243,7 +247,8 @@ def test_a_clean_measurement_has_no_outliers():
         assert not calibrate(nominal, measured).outliers()
 
 
-def test_a_row_is_an_outlier_beyond_four_robust_sigmas_per_component():
+def test_outlier_is_beyond_4_robust_sigmas():
+    """A row is an outlier beyond four robust sigmas per component."""
     nominal, _, measured, _ = planted("position", 1)
     found = calibrate(nominal, measured)
     for size, expected in ((3.8, []), (4.2, [8])):
@@ -254,7 +259,8 @@ def test_a_row_is_an_outlier_beyond_four_robust_sigmas_per_component():
         assert [item[1] for item in changed.outliers()] == expected
 
 
-def test_a_prior_holds_where_it_is_tight_and_is_not_felt_where_it_is_loose():
+def test_prior_holds_where_it_is_tight():
+    """A prior holds where it is tight and is not felt where it is loose."""
     nominal = load("ur5")
     measured = measure(cell(perturb(nominal, 3, 1e-3, 2e-3), 3), "pose", 60, 3, sigma=SIGMA, sigma_rotation=2e-4)
     start = polish_frames(install(nominal, [measured]), [measured]).cell

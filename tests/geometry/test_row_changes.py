@@ -59,7 +59,8 @@ CHANGES = [
 
 @pytest.mark.parametrize("poses", [False, True])
 @pytest.mark.parametrize(("change", "code", "size"), CHANGES)
-def test_a_step_is_named_with_its_row_and_its_size(change, code, size, poses):
+def test_step_is_named_with_row_and_size(change, code, size, poses):
+    """A step is named with its row and its size."""
     truth = truth_of(1)
     block = measured(truth, change(truth), random_joints(truth.chain, ROWS, 1), 1, poses)
     (found,) = changes(block)
@@ -80,7 +81,8 @@ def test_a_drift_is_told_from_a_step(code, growth):
     assert abs(found.values["size"]) == pytest.approx(size, abs=4 * found.values["sigma"])
 
 
-def test_a_scale_that_changes_between_rows_is_named():
+def test_changing_scale_is_named():
+    """A scale that changes between rows is named."""
     truth = truth_of(2)
     block = measured(truth, truth, random_joints(truth.chain, ROWS, 2), 2)
     later = (np.arange(ROWS) >= CUT)[:, None]
@@ -114,7 +116,7 @@ def test_a_sound_file_changed_nowhere(seeds):
         assert changes(measured(truth, truth, random_joints(truth.chain, ROWS, seed), seed, seed % 2 == 0)) == []
 
 
-def test_an_effect_of_a_joint_in_sorted_rows_is_no_change():
+def test_effect_in_sorted_rows_is_no_change():
     """Rows in the order of joint 1, at whose middle something in the arm gives way: a model lacks that, no time."""
     truth = truth_of(3)
     q = random_joints(truth.chain, ROWS, 3)
@@ -124,7 +126,8 @@ def test_an_effect_of_a_joint_in_sorted_rows_is_no_change():
         assert [one.code for one in changes(replace(block, position=block.position + later * [0, 0, 4e-4]))] == codes
 
 
-def test_grossly_wrong_rows_hide_no_change_and_are_none():
+def test_gross_rows_hide_no_change():
+    """Grossly wrong rows hide no change and are none."""
     truth = truth_of(4)
     q = random_joints(truth.chain, ROWS, 4)
     for later, codes in ((truth, []), (moved_station(truth), ["station-changed"])):

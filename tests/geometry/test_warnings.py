@@ -83,18 +83,21 @@ def one_component(seed: int) -> PoseMeasurements:
 
 @pytest.mark.parametrize("measured", [scattered, one_component])
 @pytest.mark.parametrize("seeds", [range(4), pytest.param(range(4, 16), marks=pytest.mark.slow)])
-def test_bad_rows_scattered_over_the_day_and_noise_of_one_component_are_no_set_up(measured, seeds):
+def test_scattered_bad_rows_are_no_set_up(measured, seeds):
+    """Bad rows scattered over the day, and noise of one component, are no set-up."""
     assert not any(changes(calibrate(measured(seed))) for seed in seeds)
 
 
-def test_errors_that_neighbours_share_are_called_systematic():
+def test_shared_errors_are_systematic():
+    """Errors that neighbours share are called systematic."""
     truth = truth_of(1)
     terms = (Term("theta2", "sin", 1, 3), Term("theta3", "cos", 2, 4))
     wavy = replace(truth, deflection=Deflection(terms, np.array([4e-4, 4e-4]), truth.chain))
     assert any(one.code == "systematic-residual" for one in diagnose(calibrate(nearby(wavy, 40, 6, 1))))
 
 
-def test_an_instrument_worse_than_it_states_is_named():
+def test_poor_instrument_is_named():
+    """An instrument worse than it states is named."""
     measured = measure(truth_of(2), "position", 120, 2, sigma=10 * SIGMA)
     optimistic = replace(measured, sigma=np.full((120, 3), SIGMA))
     (found,) = diagnose(calibrate(optimistic))
@@ -120,7 +123,7 @@ def test_the_rank_is_told_with_its_gap():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_tool_and_base_are_said_to_be_confused_only_where_they_are(seed):
+def test_confusion_of_tool_and_base_is_said(seed):
     """Positions in a small region with the wrist held still, against positions anywhere."""
     truth = truth_of(seed)
     centre = np.array([0.3, -1.2, 1.4, -0.5, 1.2, 0.4])
@@ -136,7 +139,7 @@ def test_tool_and_base_are_said_to_be_confused_only_where_they_are(seed):
 
 
 @pytest.mark.parametrize(("turned", "most"), [((), 1), ((1,), 8), ((2, 5), 10)])
-def test_a_reversal_that_no_placement_makes_good_is_not_searched_for(monkeypatch, turned, most):
+def test_unplaceable_reversal_not_searched(monkeypatch, turned, most):
     """Trying every joint fits placements 7, 12 and 16 times."""
     cell, placed = perturbed_cell(load("ur5"), seed=1), []
     block = measured_by(cell, random_joints(cell.nominal, 60, 0), 1)
@@ -151,7 +154,7 @@ def test_a_reversal_that_no_placement_makes_good_is_not_searched_for(monkeypatch
 
 
 @pytest.mark.parametrize(("joint", "end"), [(5, "--tip "), (0, "--base "), (2, None)])
-def test_a_joint_that_moves_nothing_measured_is_named(joint, end):
+def test_joint_without_effect_is_named(joint, end):
     """A gripper's column beside the arm's, a track that carries the instrument, too."""
     cell = perturbed_cell(load("ur5"), seed=2)
     q = random_joints(cell.nominal, 60, 0)
@@ -177,7 +180,8 @@ REAL = {
 
 @pytest.mark.parametrize("folder", REAL)
 @pytest.mark.parametrize("way", [0.0, 1.0])
-def test_real_poses_are_sound_unless_a_joint_counts_from_the_one_before(data, folder, way):
+def test_real_poses_are_sound(data, folder, way):
+    """Real poses are sound unless a joint counts from the one before."""
     robot, file = (data / folder / name for name in REAL[folder])
     arm = load(robot)
     (block,) = read_measurements(file, arm.joint_names)

@@ -23,7 +23,7 @@ def made(tmp_path, content: str):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_encoders_and_platform_find_the_same_postures(name):
+def test_encoders_and_platform_agree(name):
     """Coordinates → joints → coordinates, on the branch of home, loops closed to rounding; records as random ones."""
     known, rng = find(name).mechanism, np.random.default_rng(0)
     robot = known.robot
@@ -38,7 +38,8 @@ def test_encoders_and_platform_find_the_same_postures(name):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_velocities_and_accelerations_are_derivatives(name):
+def test_velocities_are_derivatives(name):
+    """Velocities and accelerations are derivatives."""
     known, h = find(name).mechanism, 1e-4
     robot, rng = known.robot, np.random.default_rng(1)
     x = 0.5 * rng.uniform(robot.lower, robot.upper)
@@ -68,7 +69,7 @@ def test_poses_out_of_reach_are_named():
     assert told.value.samples == (1,)
 
 
-def test_a_stretched_leg_is_a_singularity_of_type_1():
+def test_stretched_leg_is_type_1_singularity():
     """Leg 1 of the DualV at full reach, its attachment 0.56 m from its pivot, the other loops still closed."""
     known = find("dualv").mechanism
     pivot = 0.41 * np.array([np.cos(np.radians(15.52)), np.sin(np.radians(15.52))])
@@ -79,14 +80,15 @@ def test_a_stretched_leg_is_a_singularity_of_type_1():
 @pytest.mark.parametrize(
     ("y", "words"), [(0.1077033, "singular .type 2"), (0.05, "beyond a type 2 singularity|branch")]
 )
-def test_a_five_bar_in_its_type_2_singularity_and_beyond_is_told(y, words):
+def test_five_bar_tells_type_2_singularity(y, words):
     """Distal links in line, at y² = 0.3² - 0.28²: locked motors do not hold the tip."""
     known = find("fivebar").mechanism
     with pytest.raises(NoPosture, match=words):
         known.place(np.array([[0.0, y - 0.5]]))
 
 
-def test_a_stewart_platform_upside_down_is_beyond_a_type_2_singularity():
+def test_inverted_stewart_is_beyond_type_2():
+    """A Stewart platform upside down is beyond a type 2 singularity."""
     known = find("stewart").mechanism
     with pytest.raises(NoPosture, match="type 2"):
         known.place(np.array([[0.0, 0.0, -0.5, 0.0, 0.0, 0.0]]))
@@ -108,7 +110,8 @@ def test_a_stewart_platform_upside_down_is_beyond_a_type_2_singularity():
         ("stewart", 'end = "spherical"', "", "freedom|close|motions"),
     ],
 )
-def test_files_that_contradict_themselves_are_refused(tmp_path, name, old, new, words):
+def test_contradictory_files_are_refused(tmp_path, name, old, new, words):
+    """Files that contradict themselves are refused."""
     assert old in text(name)
     with pytest.raises(RobotError, match=words):
         made(tmp_path, text(name).replace(old, new, 1))

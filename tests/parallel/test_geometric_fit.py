@@ -32,7 +32,7 @@ def test_platform_poses_tell_the_geometry(name):
 
 
 @pytest.mark.slow
-def test_redundant_encoders_alone_mend_what_they_contradict():
+def test_redundant_encoders_mend_geometry():
     """Without any pose: the encoders of the DualV agree to their noise, and its angle is better by several times."""
     nominal, _, q, x = planted("dualv")
     found = fit_loops(nominal, q)
@@ -42,13 +42,14 @@ def test_redundant_encoders_alone_mend_what_they_contradict():
     assert angle[1] < 0.4 * angle[0]
 
 
-def test_readings_alone_tell_nothing_without_redundancy():
+def test_readings_alone_need_redundancy():
+    """Readings alone tell nothing without redundancy."""
     nominal, _, q, _ = planted("stewart", rows=8)
     with pytest.raises(Unidentifiable, match="as many encoders as freedoms"):
         fit_loops(nominal, q)
 
 
-def test_parameters_that_would_open_the_loops_are_left_out():
+def test_loop_opening_parameters_left_out():
     """No axis of a planar robot tilts: its loops would not close; of a spatial one all may."""
     names = [one.name for one in loop_parameters(find("dualv").mechanism)]
     assert "leg1.d2" in names and not any("alpha" in name or ".base.rx" in name or ".r2" in name for name in names)

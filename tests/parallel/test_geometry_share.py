@@ -38,7 +38,7 @@ def refitted(found: ParallelDynamics, known: ClosedRobot) -> np.ndarray:
     [("fivebar", "motor"), *(pytest.param(*each, marks=pytest.mark.slow)
       for each in (("dualv", "motor"), ("dualv", "power"), ("stewart", "motor")))],
 )  # fmt: skip
-def test_sensitivities_are_those_of_identifications_on_other_geometries(name, rows):
+def test_sensitivities_match_other_geometry(name, rows):
     """On platform, motor and power rows, with a prior; constants that are choices of frames have none."""
     robot = fitted(find(name).mechanism)
     logs = [recorded(robot.mechanism, load, seed=k, samples=200) for k, load in enumerate(((), ("5",)))]
@@ -55,7 +55,7 @@ def test_sensitivities_are_those_of_identifications_on_other_geometries(name, ro
 
 
 @pytest.mark.slow
-def test_geometries_that_fits_find_move_the_dynamics_as_stated(tmp_path):
+def test_fitted_geometries_move_dynamics(tmp_path):
     """Twelve fits of a DualV from other noise, the same torques: shifts of its 27 parameters, in sigma_geometry."""
     known = find("dualv").mechanism
     logs = [recorded(known, load, seed=k) for k, load in enumerate(((), ("5",)))]

@@ -50,7 +50,7 @@ def test_columns_are_sums_over_the_legs(rows):
 
 
 @pytest.mark.slow
-def test_identical_legs_have_smaller_sigma_and_are_tested(tmp_path):
+def test_identical_legs_have_smaller_sigma(tmp_path):
     """Truth within 4 σ, no finding, and the same file for other commands; a leg that is 20 % off is named."""
     alike, apart = identified(identical_legs=True, prior="none"), identified(prior="none")
     own, other = (dict(zip(x.estimate.names, x.estimate.sigma)) for x in (alike, apart))

@@ -37,7 +37,7 @@ def change_of(pose: np.ndarray, twist: np.ndarray, acceleration: np.ndarray) -> 
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_torques_are_those_of_pinocchios_constrained_dynamics(name):
+def test_torques_are_those_of_pinocchio(name):
     """Its accelerations under random torques, put into our model, give these torques back, to 1e-8 and better."""
     known, rng = robot(name), np.random.default_rng(1)
     model = make_parallel_model(known, [""], payloads=["load"])
@@ -62,7 +62,8 @@ def test_torques_are_those_of_pinocchios_constrained_dynamics(name):
 
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("rows", ["", "power"])
-def test_the_regressor_times_parameters_is_the_torque(name, rows):
+def test_regressor_gives_the_torque(name, rows):
+    """The regressor times parameters is the torque."""
     known, rng = robot(name), np.random.default_rng(2)
     model = make_parallel_model(known, rows=rows_named(known, rows), payloads=["load"], passive="Fv Fc")
     values, states = rng.normal(size=model.p), model.sample(20, rng)
@@ -90,7 +91,7 @@ def test_power_is_the_change_of_energy(name):
     assert np.allclose(np.gradient(energy, t[:, 0])[1:-1], power[1:-1], rtol=0, atol=2e-5 * np.abs(power).max())
 
 
-def test_dualv_has_the_papers_sixteen_base_parameters():
+def test_dualv_has_16_base_parameters():
     """zz1iR, mx2iR, my2i, and zz4R, mx4, my4R, m4R, regrouped as Briot, Gautier & Krut's procedure does."""
     known = robot("dualv")
     for rows in ("platform", "power"):
@@ -112,12 +113,13 @@ def expressed(model: ParallelModel, base: bases.Base, name: str) -> dict[str, fl
     return {model.names[k]: row[k] for k in np.flatnonzero(np.abs(row) > 1e-9)}
 
 
-def test_redundant_actuators_have_no_motor_rows():
+def test_redundant_actuators_lack_motor_rows():
+    """Redundant actuators have no motor rows."""
     with pytest.raises(UsageError, match="overconstraint"):
         rows_named(robot("dualv"), "motor")
 
 
-def test_the_rows_of_a_motion_under_several_loads_are_those_of_each_load():
+def test_rows_of_loads_match_single_loads():
     """Functions of the platform's coordinates for designs, against the regressor at the encoders' motion."""
     known = find("fivebar").mechanism
     model = make_parallel_model(known, ["Ia Fv Fc off"], payloads=["tool"])

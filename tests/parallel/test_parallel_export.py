@@ -42,7 +42,7 @@ def moved(robot: OpenedRobot, t: np.ndarray):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_pinocchio_closes_the_urdf_by_the_yaml_and_accelerates_alike(name):
+def test_pinocchio_accelerates_urdf_alike(name):
     """Contact dynamics of the URDF's tree with the pairs of ``robot.yaml`` as constraints give the motion's q̈."""
     robot = opened(name)
     motion, tau = moved(robot, np.array([0.1, 0.3]))
@@ -93,7 +93,7 @@ for step, text, names, tau in json.load(sys.stdin):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_mujoco_moves_as_planned_the_closer_the_shorter_its_steps(name):
+def test_mujoco_moves_as_planned(name):
     """Played from home without control, the torques of a motion lead to it with an error in proportion to the step.
 
     In an interpreter that has MuJoCo: CALIB_MUJOCO=/path/to/python.
@@ -116,7 +116,8 @@ def test_mujoco_moves_as_planned_the_closer_the_shorter_its_steps(name):
     assert errors[1] < 0.15 * errors[0] and errors[1] < 1e-3
 
 
-def test_masses_are_needed_and_the_folder_of_a_result(tmp_path, capsys):
+def test_masses_and_result_folder_are_needed(tmp_path, capsys):
+    """Masses are needed, and the folder of a result."""
     robot = find("fivebar")
     assert cli.run(["export", "fivebar", "--into", str(tmp_path / "a")]) == 2
     assert "give the folder of a fit or of an identification" in capsys.readouterr().err

@@ -26,7 +26,7 @@ def found(name: str, noise: float, seed: int, changes: dict | None = None, sampl
 
 
 @pytest.mark.parametrize("name", ["dualv", pytest.param("stewart", marks=pytest.mark.slow)])
-def test_gains_come_from_a_payload_of_known_mass(name):
+def test_known_payload_gives_gains(name):
     """Redundant actuators with a preload that nobody states, currents with noise of different size."""
     gains, identified = found(name, 0.2 if name == "dualv" else 5.0, 0)
     assert np.abs(identified.gains / gains - 1.0).max() < 0.02
@@ -36,7 +36,7 @@ def test_gains_come_from_a_payload_of_known_mass(name):
 
 
 @pytest.mark.slow
-def test_sigmas_of_gains_hold_under_strong_noise():
+def test_gain_sigmas_hold_under_noise():
     """Six trials with 3 N m of noise on some 20 N m, where least squares draws the gains to zero."""
     trials = [found("dualv", 3.0, seed, samples=8000) for seed in range(6)]
     away = np.array([(own.gains - gains) / own.sigma for gains, own in trials])
@@ -51,6 +51,7 @@ def test_sigmas_of_gains_hold_under_strong_noise():
         ({"payload": {"5": {"mass": 5.37}, "6": {"mass": 1.0}}}, "was the payload attached"),
     ],
 )
-def test_gains_without_a_known_payload_are_refused(changes, said):
+def test_gains_need_a_known_payload(changes, said):
+    """Gains without a known payload are refused."""
     with pytest.raises(UsageError, match=said):
         found("dualv", 0.5, 0, changes, samples=500)

@@ -61,7 +61,7 @@ def away(found, name: str) -> np.ndarray:
 
 
 @pytest.mark.slow  # the simulation's kernel takes 14 s to compile
-def test_instruments_cure_the_bias_of_noise_in_the_loop():
+def test_instruments_cure_bias_of_the_loop():
     """DualV, 0.7 mrad of noise in the loop: least squares is beyond 5 σ, with instruments 95 % of 28 are in 2 σ."""
     recordings, robot = logs("dualv", 1000.0, 8.0, 7e-4, 6.0), find("dualv")
     for method, beyond in (("wls", True), ("iv", False), ("didim", False)):
@@ -74,7 +74,7 @@ def test_instruments_cure_the_bias_of_noise_in_the_loop():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["cloe", "clie"])
-def test_output_error_recovers_a_parallel_robot_within_its_sigma(method):
+def test_output_error_recovers_robot(method):
     """Five-bar, 1 s, without the payload, with noise of the encoders in the loop: 50 rows for 15 parameters."""
     (recording, _), robot = logs("fivebar", 4000.0, 40.0, 1e-5, 1.0), find("fivebar")
     found = identify_parallel(
@@ -85,7 +85,8 @@ def test_output_error_recovers_a_parallel_robot_within_its_sigma(method):
 
 
 @pytest.mark.slow
-def test_gains_of_another_controller_are_noticed():
+def test_other_controllers_gains_are_noticed():
+    """Gains of another controller are noticed."""
     recordings = logs("dualv", 3000.0, 30.0, 1e-5, 3.0)
     found = identify_parallel(find("dualv"), recordings, options=options("iv", 1500.0, 30.0, 40.0))
     assert {"loop-gains-off", "loop-not-followed"} & {one.code for one in found.noticed}
@@ -93,7 +94,7 @@ def test_gains_of_another_controller_are_noticed():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["iv", "didim"])
-def test_the_geometrys_share_is_that_of_whole_identifications(method):
+def test_geometry_share_is_the_derivative(method):
     """Derivative of the estimate by the loops' constants, against identifications on two geometries: to 2 % in σ."""
     robot, recordings = fitted(find("fivebar").mechanism), logs("fivebar", 4000.0, 40.0, 1e-4, 3.0)
     chosen = options(method, 4000.0, 40.0, 40.0)
@@ -110,7 +111,7 @@ def test_the_geometrys_share_is_that_of_whole_identifications(method):
 
 
 @pytest.mark.slow
-def test_the_simulated_robot_meets_its_equations_with_stiff_friction_too():
+def test_stiff_simulation_meets_equations():
     """Held torques meet those of the model as 1 / rate; friction that no single step could follow does not chatter."""
     known, wrong = find("fivebar").mechanism, []
     model, values = truth(known, "Ia Fv Fc")
@@ -130,11 +131,12 @@ def test_the_simulated_robot_meets_its_equations_with_stiff_friction_too():
 
 
 @pytest.mark.slow
-def test_what_no_simulation_can_follow_is_said():
+def test_impossible_simulation_is_said():
+    """What no simulation can follow is said."""
     model, values = truth(find("dualv").mechanism, "Ia Fv Fc")
     with pytest.raises(CannotSimulate, match="not positive definite"):
         model.plant(-values).run(gains("dualv", 1000.0, 8.0), asked("dualv", 0.2))
-    with pytest.raises(CannotSimulate, match="without v0 above 0"):
+    with pytest.raises(CannotSimulate, match="state its v0, above 0"):
         replace(model, terms=tuple(replace(x, settings=(0.0,) * len(x.settings)) for x in model.terms)).plant(
             values
         ).run(gains("dualv", 1000.0, 8.0), asked("dualv", 0.2))
@@ -146,11 +148,12 @@ def test_what_no_simulation_can_follow_is_said():
         ({"method": "ekf"}, r"parallel robots take ols, wls.*iv, didim, pc-iv, pc-didim, cloe, clie"),
         ({"method": "cloe", "rows": "power"}, r"rows = 'power' is not supported"),
         ({"method": "gtls"}, "differentiates the torques of a serial arm"),
-        ({"rows": "power"}, r"rows = 'power' is not supported; methods that do: ols, wls"),
-        ({"loop": None}, r"needs a \[loop\]|state the controller"),
+        ({"rows": "power"}, r"rows = 'power' is not supported; methods that support it: ols, wls"),
+        ({"loop": None}, r"needs a \[loop\]|needs the closed loop"),
     ],
 )
-def test_methods_and_rows_without_a_simulation_are_refused(more, said):
+def test_methods_need_a_simulation(more, said):
+    """Methods and rows without a simulation are refused."""
     reference = asked("dualv", 1.0)
     given = (reference.t, reference.q, 10.0 * np.sin(9.0 * reference.q), "torque", find("dualv").chain.joint_names)
     table = {"method": "iv", "loop": {"controller": "pd", "kp": 1.0, "kd": 1.0}} | more

@@ -68,7 +68,8 @@ def test_a_fit_shows_its_poses_and_errors(fitted, tmp_path):
     assert np.isnan(measured.turned).all()
 
 
-def test_motions_and_torques_are_shown_under_the_names_of_actuators_and_rows(fitted, tmp_path):
+def test_views_name_actuators_and_rows(fitted, tmp_path):
+    """Motions and torques are shown under the names of actuators and rows."""
     folder = tmp_path / "id"
     find("dualv").write(folder)
     q = np.tile(find("dualv").mechanism.home.q[:, find("dualv").chain.actuated], (3, 1))

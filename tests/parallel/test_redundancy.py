@@ -42,7 +42,7 @@ def run(model, values, carried, preload=10.0):
     return simulate(model, values, controller, *reference(), carried, seed=1)
 
 
-def test_torques_are_shared_out_and_overconstraint_does_no_work():
+def test_overconstraint_does_no_work():
     """τ = (Jᵀ)⁺ w + N c: the forces come back, c comes back, whatever c; without preload no torques are smaller."""
     known = find("dualv").mechanism
     motion = along(known, *reference(0.3))
@@ -59,7 +59,7 @@ def test_torques_are_shared_out_and_overconstraint_does_no_work():
 
 
 @pytest.mark.slow  # the simulation's kernel takes 14 s to compile
-def test_a_simulated_robot_obeys_its_inverse_dynamics(dualv):
+def test_simulation_obeys_inverse_dynamics(dualv):
     """The forces of the log are those of the model on the log's own motion; the preload is the one asked for."""
     known, model, values, runs = dualv
     log = runs[("5",)]
@@ -86,7 +86,7 @@ def identified(dualv, rows: str):
 
 
 @pytest.mark.slow  # as above
-def test_inverse_dynamics_and_power_identify_it_and_weigh_its_payload(dualv):
+def test_both_models_weigh_the_payload(dualv):
     """Two runs, one with payload (eq. 36): its mass to 1 %, base parameters within their σ, IDIM tighter than PIM."""
     _, truth_model, truth, _ = dualv
     own, sigmas = dict(zip(truth_model.names, truth)), {}
@@ -112,7 +112,7 @@ def test_what_cannot_be_simulated_is_said(dualv):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["fivebar", "stewart"])
-def test_platforms_that_move_beside_their_coordinates_are_simulated(name):
+def test_dependent_platform_is_simulated(name):
     """The five-bar's platform turns as its loop says: held torques meet those of the model as 1 / rate."""
     known = find(name).mechanism
     model = make_parallel_model(known, ["Ia Fv Fc"], v0=0.05, passive="Fv")
@@ -131,7 +131,7 @@ def test_platforms_that_move_beside_their_coordinates_are_simulated(name):
     assert wrong[0] < 0.02 and wrong[1] < 0.35 * wrong[0]
 
 
-def test_slopes_for_the_design_are_derivatives():
+def test_design_slopes_are_derivatives():
     """Of Σ weights · W by x, v, a, against differences of the whole sum."""
     known = find("dualv").mechanism
     model = make_parallel_model(known, ["Fv Fc"], v0=0.5)

@@ -69,7 +69,8 @@ def starts(space: SearchSpace, count: int, seed: int = 0) -> np.ndarray:
         pytest.param("7 joints", "cond", marks=pytest.mark.slow),
     ],
 )
-def test_the_local_search_moves_far_and_stays_feasible(name, index, file):
+def test_far_local_search_stays_feasible(name, index, file):
+    """The local search moves far and stays feasible."""
     space = space_of(name, file)
     q = starts(space, 12)
     run = improved(space, q, index, evaluations=40)
@@ -94,7 +95,8 @@ def test_the_derivative_product_is_exact(name, kind):
     )
 
 
-def test_a_start_outside_the_constraints_is_brought_inside():
+def test_outside_start_is_brought_inside():
+    """A start outside the constraints is brought inside."""
     low = PoseConstraint("low", planar.height, planar.height_gradient)
     space = SearchSpace(planar.jacobian, planar.LOWER, planar.UPPER, planar.product, (low,))
     start = np.tile([0.9, 0.2, 0.1], (6, 1)) + 0.1 * np.random.default_rng(0).normal(size=(6, 3))

@@ -9,7 +9,7 @@ import planar
 import pytest
 from differences import check
 
-from calib.poses import constraints
+from calib.poses import pose_constraints
 from calib.poses.continuous.local import improved, merit_of
 from calib.poses.continuous.tabu import TabuRule
 from calib.poses.errors import BadInput
@@ -34,7 +34,8 @@ def outside_the_wedge(q):
 
 
 @pytest.mark.parametrize("index", ["O1", "O2", "O3", "O4", "O5", "cond"])
-def test_smoothed_merits_are_pessimistic_converge_and_have_exact_gradients(index):
+def test_smoothed_merits_are_pessimistic(index):
+    """Smoothed merits are pessimistic, converge and have exact gradients."""
     W = planar.jacobian(Q[:6]).reshape(-1, 6)
     sharp = merit(W, index)[0]
     soft = np.array([merit(W, index, a)[0] for a in (4.0, 16.0, 64.0)])
@@ -45,7 +46,8 @@ def test_smoothed_merits_are_pessimistic_converge_and_have_exact_gradients(index
 
 @pytest.mark.parametrize("index", ["O1", "O2", "O3", "O4", "O5", "cond"])
 @pytest.mark.parametrize("exact", [True, False])
-def test_gradient_in_joint_values_is_the_central_difference(index, exact):
+def test_gradient_is_central_difference(index, exact):
+    """The gradient in joint values is the central difference."""
     space = SPACE if exact else replace(SPACE, jacobian_product=None)
     q, existing = Q[:6], planar.jacobian(Q[10:12])
     slope = merit_of(space, q, index, existing)[1]
@@ -62,11 +64,11 @@ def test_gradient_in_joint_values_is_the_central_difference(index, exact):
     "constraint",
     [
         LOW,
-        constraints.height(planar.tool, -0.3, 0.9, planar.tool_jacobian),
-        constraints.axis_distance(planar.tool, 0.2, planar.tool_jacobian),
-        constraints.reach(planar.tool, 0.9, (0.1, 0, 0.2), planar.tool_jacobian),
-        constraints.orientation(planar.tool, turned(), (-2.0, 2.5), (-1.0, 1.2), planar.tool_jacobian),
-        constraints.line_of_sight(planar.tool, (2, 1, 1), (1, 0, 0.2), 0.6, planar.tool_jacobian),
+        pose_constraints.height(planar.tool, -0.3, 0.9, planar.tool_jacobian),
+        pose_constraints.axis_distance(planar.tool, 0.2, planar.tool_jacobian),
+        pose_constraints.reach(planar.tool, 0.9, (0.1, 0, 0.2), planar.tool_jacobian),
+        pose_constraints.orientation(planar.tool, turned(), (-2.0, 2.5), (-1.0, 1.2), planar.tool_jacobian),
+        pose_constraints.line_of_sight(planar.tool, (2, 1, 1), (1, 0, 0.2), 0.6, planar.tool_jacobian),
     ],
     ids=lambda c: c.name,
 )
@@ -80,13 +82,13 @@ def test_constraint_gradients(constraint):
 
 
 def test_line_of_sight_is_a_cone():
-    seen = constraints.line_of_sight(planar.tool, (5, 0.1, 0), (1, 0, 0), 0.5)
+    seen = pose_constraints.line_of_sight(planar.tool, (5, 0.1, 0), (1, 0, 0), 0.5)
     turned = np.array([[0, 0, 0.4], [0, 0, 0.6]])
     assert (seen.function(turned)[:, 0] <= 0).tolist() == [True, False]
 
 
 def test_orientation_limits_roll_and_pitch():
-    level = constraints.orientation(planar.tool, np.eye(3), (-0.1, 0.1), (-0.5, 0.5))
+    level = pose_constraints.orientation(planar.tool, np.eye(3), (-0.1, 0.1), (-0.5, 0.5))
     poses = np.array([[0, 0, 0.4], [0, 0, 0.6], [0, 0, -0.6]])  # these turn about −y: pitch −0.4, −0.6, 0.6
     values = level.function(poses)
     assert ((values <= 0).all(1)).tolist() == [True, False, False]
@@ -94,7 +96,8 @@ def test_orientation_limits_roll_and_pitch():
 
 
 @pytest.mark.parametrize("bound", [(), (LOW,), (replace(LOW, gradient=None),)], ids=["box", "exact", "differences"])
-def test_local_search_improves_and_stays_feasible(bound):
+def test_local_search_stays_feasible(bound):
+    """The local search improves and stays feasible."""
     space = replace(SPACE, constraints=bound)
     start = (0.3 * Q)[is_feasible(space, 0.3 * Q)][:5]  # clustered: much to win
     run = improved(space, start)
@@ -106,7 +109,8 @@ def test_local_search_improves_and_stays_feasible(bound):
         assert np.abs(slope[inside]).max() < 1e-2
 
 
-def test_a_predicate_is_kept_where_the_gradient_leads_into_it():
+def test_predicate_holds_against_gradient():
+    """A predicate is kept where the gradient leads into it."""
     space = replace(SPACE, feasible=outside_the_wedge)
     start = Q[is_feasible(space, Q)][:6]
     run = improved(space, start)
@@ -117,7 +121,8 @@ def test_a_predicate_is_kept_where_the_gradient_leads_into_it():
 @pytest.mark.parametrize(
     "method", ["polish", "local", "multistart", "mlsl", pytest.param("tabu", marks=pytest.mark.slow)]
 )
-def test_methods_keep_constraints_repeat_by_seed_and_beat_random_sets(method):
+def test_methods_repeat_and_beat_random(method):
+    """Methods keep constraints, repeat by seed and beat random sets."""
     space = replace(SPACE, constraints=(LOW,), feasible=outside_the_wedge)
     runs = [
         select_poses(
@@ -132,7 +137,8 @@ def test_methods_keep_constraints_repeat_by_seed_and_beat_random_sets(method):
     assert runs[0].history[-1] == runs[0].value and (np.diff(runs[0].history) >= -1e-9).all()
 
 
-def test_leaving_the_candidates_beats_staying_among_few():
+def test_leaving_candidates_beats_staying():
+    """Leaving the candidates beats staying among few."""
     kept = select_poses(planar.jacobian(Q[:12]), 5, q=Q[:12])
     moved = select_poses(None, 5, q=Q[:12], settings=SearchSettings(method="polish"), space=SPACE)
     assert kept.value < moved.value
@@ -140,7 +146,8 @@ def test_leaving_the_candidates_beats_staying_among_few():
     assert moved.value**2 * 5 > kept.bound.upper  # above what any five of the candidates can reach
 
 
-def test_more_starts_are_no_worse_than_the_first_and_time_ends_them():
+def test_more_starts_are_no_worse():
+    """More starts are no worse than the first, and time ends them."""
     one = select_poses(None, 5, q=Q[:40], settings=SearchSettings(method="local"), space=SPACE)
     more = select_poses(None, 5, q=Q[:40], settings=SearchSettings(method="multistart", starts=4), space=SPACE)
     none = select_poses(
@@ -150,7 +157,8 @@ def test_more_starts_are_no_worse_than_the_first_and_time_ends_them():
 
 
 @pytest.mark.parametrize("bound", [(), (LOW,)], ids=["box", "constrained"])
-def test_the_bound_over_the_whole_space_holds_the_searches_between_chance_and_itself(bound):
+def test_bound_holds_over_the_whole_space(bound):
+    """The bound over the whole space holds the searches between chance and itself."""
     space = replace(SPACE, constraints=bound)
     few = Q[is_feasible(space, Q)][:12]
     ceiling = bound_over_space(space, few, 6)
@@ -161,14 +169,16 @@ def test_the_bound_over_the_whole_space_holds_the_searches_between_chance_and_it
     assert bound_over_space(space, few, 6, climbs=0).upper < best.value**2 * 6  # the candidates' bound does not hold
 
 
-def test_multistart_on_other_processes_gives_the_same_poses():
+def test_multistart_processes_agree():
+    """Multistart on other processes gives the same poses."""
     here = select_poses(None, 5, SearchSettings(method="multistart", starts=3), q=Q, space=SPACE)
     with ProcessPoolExecutor(2) as pool:
         there = select_poses(None, 5, SearchSettings(method="multistart", starts=3), q=Q, space=SPACE, map=pool.map)
     assert (here.q == there.q).all()
 
 
-def test_interrupted_local_search_returns_the_best_so_far():
+def test_interrupted_search_returns_the_best():
+    """An interrupted local search returns the best so far."""
     calls = [0]
 
     def jacobian(q):
@@ -182,7 +192,8 @@ def test_interrupted_local_search_returns_the_best_so_far():
     assert run.interrupted and run.merit > merit_of(SPACE, start, "O1")[0]
 
 
-def test_existing_rows_of_another_instrument_count():
+def test_rows_of_other_instrument_count():
+    """Existing rows of another instrument count."""
     position = planar.jacobian(Q[50:60])[:, :1]
     chosen = select_poses(None, 3, SearchSettings(method="tabu", rule=QUICK), q=Q, space=SPACE, existing=position)
     assert chosen.q.shape == (3, 3) and chosen.value > chosen.random_baseline

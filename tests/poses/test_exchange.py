@@ -13,7 +13,7 @@ from calib.poses.design import Pool, best_addition, design_of, gains_of, with_ad
 from calib.poses.errors import BadInput, NothingFeasible, NotIdentifiable, TooFewCandidates
 from calib.poses.exchange import detmax, exchanged, greedy
 from calib.poses.indices import observability
-from calib.poses.information import prepared
+from calib.poses.scaled_jacobians import prepared
 from calib.poses.select import SearchSettings, random_baseline, select_poses
 
 ARM = library_arm.jacobian(library_arm.random_poses(400, 0))
@@ -52,7 +52,8 @@ def test_sandwich(function, m):
     assert len(set(chosen.indices.tolist())) == m
 
 
-def test_bound_is_tight_and_its_weights_are_feasible():
+def test_bound_is_tight_and_feasible():
+    """The bound is tight, and its weights are feasible."""
     for capped, most in ((True, 1.0), (False, 17.0)):
         result = bound(ARM, 17, capped=capped, tolerance=1e-4)
         assert result.gap <= 1e-4
@@ -97,7 +98,8 @@ def test_detmax_finds_the_best_of_all_sets():
         assert tuple(select_poses(jacobians, 4, SearchSettings(seed=seed)).indices) == best
 
 
-def test_exchange_ends_where_no_single_exchange_helps():
+def test_exchange_ends_at_local_optimum():
+    """The exchange ends where no single exchange helps."""
     candidates = prepared(ARM[:120], 10)
     pool = Pool(candidates.z, candidates.known)
     design = detmax(pool, exchanged(pool, greedy(pool, 10)))
@@ -113,7 +115,8 @@ def test_exchange_ends_where_no_single_exchange_helps():
 @pytest.mark.parametrize(
     "index", [*(pytest.param(index, marks=pytest.mark.slow) for index in ("O2", "O3", "O4", "O5")), "cond"]
 )
-def test_other_indices_improve_on_the_d_optimal_and_on_random_sets(index):
+def test_other_indices_beat_d_optimal_sets(index):
+    """Other indices improve on the D-optimal and on random sets."""
     start = observability(ARM[of_the_arm().indices], index)
     chosen = select_poses(ARM, 17, SearchSettings(index=index))
     assert chosen.value == pytest.approx(observability(ARM[chosen.indices], index))
@@ -131,7 +134,8 @@ def test_o1_selection_does_not_see_units():
     assert other.efficiency == pytest.approx(one.efficiency, rel=1e-5)
 
 
-def test_what_is_known_already_is_taken_into_account():
+def test_known_information_is_counted():
+    """What is known before is taken into account."""
     before = ARM[:30]
     chosen = select_poses(ARM[30:], 6, existing=before)
     together = np.concatenate([ARM[30:][chosen.indices], before])
@@ -156,7 +160,9 @@ def test_the_seed_repeats_every_bit():
     assert random_baseline(few, 17, seed=6) != one.random_baseline
 
 
-def test_interrupted_exchange_returns_the_best_so_far():
+def test_interrupted_exchange_returns_best():
+    """An interrupted exchange returns the best so far."""
+
     def stop(done, total, message):
         if done == 3:
             raise KeyboardInterrupt
@@ -184,7 +190,9 @@ def test_errors_say_what_and_why():
         select_poses(ARM, 17, SearchSettings(method="tabu"))
 
 
-def test_candidates_keep_limits_and_predicate():
+def test_candidates_keep_limits_predicate():
+    """Candidates keep limits and predicate."""
+
     def upper_half(q):
         return q[:, 0] > 0
 
@@ -205,7 +213,8 @@ def test_nothing_feasible_gives_the_share():
 
 
 @pytest.mark.parametrize("spare", [1, 2, 5, 40])
-def test_bound_is_tight_with_few_candidates_to_spare(spare):
+def test_bound_is_tight_with_few_candidates(spare):
+    """The bound is tight with few candidates to spare."""
     few = ARM[: 17 + spare]
     chosen = select_poses(few, 17)
     assert chosen.bound.gap < 1e-3 and chosen.efficiency <= 1 + 1e-12

@@ -33,7 +33,8 @@ def test_gradient_is_the_central_difference(W, index):
         assert (slope * direction).sum() == pytest.approx(difference, rel=1e-6, abs=1e-8)
 
 
-def test_only_o1_ranks_sets_alike_in_other_units():
+def test_only_o1_ignores_units():
+    """Only O1 ranks sets alike in other units."""
     sets = library_arm.jacobian(library_arm.random_poses(40 * 17, 5)).reshape(40, 17, 6, -1)
     scale = 10.0 ** np.random.default_rng(6).uniform(-2, 2, sets.shape[-1])
     orders = {i: [np.argsort([observability(W * c, i) for W in sets]) for c in (1.0, scale)] for i in INDICES}

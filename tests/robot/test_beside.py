@@ -41,7 +41,8 @@ def arm(source: str) -> tuple[urdf.Chain, capsules.Capsules]:
     return chain, capsules.from_chain(chain, 0.03, -0.5, targets=[(0.0, 0.02, 0.1)], beside=beside)
 
 
-def test_links_beside_stand_where_pinocchio_puts_them():
+def test_links_beside_agree_with_pinocchio():
+    """Links beside stand where Pinocchio puts them."""
     source = dual()
     chain, found = arm(source)
     names = {one.name for one in found.beside}
@@ -61,7 +62,8 @@ def test_links_beside_stand_where_pinocchio_puts_them():
             assert np.abs(lines.end[m, found.names.index(one.name)] - place).max() < 1e-12
 
 
-def test_they_are_kept_away_from_with_exact_gradients_and_in_the_compiled_test():
+def test_links_beside_are_kept_away_from():
+    """The arm keeps away from links beside it, with exact gradients and in the compiled test."""
     chain, found = arm(dual())
     assert ("left_c", "right_c") in found.pairs and ("right_jaw", "floor") in found.pairs
     assert not any(set(pair) == {"left_a", "left_b"} for pair in found.pairs)
@@ -73,7 +75,8 @@ def test_they_are_kept_away_from_with_exact_gradients_and_in_the_compiled_test()
         check(lambda x: found.distances(x[None])[0], found.gradients(row[None])[0], row, tolerance=1e-5)
 
 
-def test_limits_say_what_stands_beside_the_arm(tmp_path):
+def test_limits_name_what_stands_beside(tmp_path):
+    """Limits say what stands beside the arm."""
     path = tmp_path / "dual.urdf"
     path.write_text(dual())
     chain = urdf.read(path, tip="right_tool0")
@@ -90,7 +93,8 @@ def test_limits_say_what_stands_beside_the_arm(tmp_path):
     assert not any("left_a" in words for words in without.checked)
 
 
-def test_links_beside_without_shapes_are_named_where_shapes_are_used(tmp_path):
+def test_links_beside_need_shapes(tmp_path):
+    """Links beside without shapes are named where shapes are used."""
     sphere = '<collision><geometry><sphere radius="0.02"/></geometry></collision>'
     shaped = dual().replace('<link name="right_c"></link>', f'<link name="right_c">{sphere}</link>')
     path = Path(tmp_path / "shaped.urdf")
@@ -100,7 +104,7 @@ def test_links_beside_without_shapes_are_named_where_shapes_are_used(tmp_path):
     assert any("left_a" in words and "without collision shapes" in words for words in said.unchecked)
 
 
-def test_pairs_that_touch_in_nearly_all_postures_are_named_as_not_checked():
+def test_always_touching_pairs_are_named():
     """Axes that meet: the links around a link without length have a point in common."""
     source = robot(
         joint("a", "revolute", "base", "one", axis("0 0 1"), "0 0 0.4"),
@@ -112,7 +116,9 @@ def test_pairs_that_touch_in_nearly_all_postures_are_named_as_not_checked():
     assert any(words.startswith("collision of base with two (their shapes touch") for words in said.unchecked)
 
 
-def test_an_arm_on_a_pillar_is_no_thicker_for_it():
+def test_pillar_makes_arm_no_thicker():
+    """An arm on a pillar is no thicker for it."""
+
     def radius(height: float) -> float:
         shoulder = joint("a", "revolute", "base", "one", axis("0 1 0"), f"0 0 {height}")
         elbow = joint("b", "revolute", "one", "two", axis("0 1 0"), "1 0 0")
@@ -123,7 +129,8 @@ def test_an_arm_on_a_pillar_is_no_thicker_for_it():
     assert radius(0.2) == 0.11 and radius(1.0) == radius(4.0) == 0.15
 
 
-def test_a_stated_posture_places_them_by_capsules_and_by_shapes(tmp_path):
+def test_posture_places_links_beside(tmp_path):
+    """A stated posture places the links beside the arm by capsules and by shapes."""
     sphere = '<collision><geometry><sphere radius="0.02"/></geometry></collision>'
     path, stated = tmp_path / "dual.urdf", {"collision": {"posture": {"left_2": "40 deg", "left_finger": "20 mm"}}}
     values = {"left_2": np.radians(40.0), "left_finger": 0.02}
@@ -153,7 +160,8 @@ def test_a_stated_posture_places_them_by_capsules_and_by_shapes(tmp_path):
     "posture, words",
     [({"right_2": 0.1}, "joint outside the arm 'right_2' is not one of"), ({"left_9": 0.1}, "did you mean 'left_")],
 )
-def test_a_posture_of_other_joints_is_refused(tmp_path, posture, words):
+def test_posture_of_other_joints_is_refused(tmp_path, posture, words):
+    """A posture of other joints is refused."""
     path = tmp_path / "dual.urdf"
     path.write_text(dual())
     with pytest.raises(UsageError, match=words):

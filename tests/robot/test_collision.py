@@ -107,7 +107,8 @@ def test_every_primitive_and_a_mesh(tmp_path):
     assert ("base", "floor") not in found.pairs and ("base", "two") in found.pairs
 
 
-def test_pairs_that_always_touch_are_left_out_and_listed(tmp_path):
+def test_always_touching_pairs_are_listed(tmp_path):
+    """Pairs that always touch are left out and listed."""
     path = tmp_path / "arm.urdf"
     path.write_text(planar("", *[shape('<sphere radius="2"/>')] * 3))
     found = collision.from_urdf(path)
@@ -122,7 +123,8 @@ def test_pairs_that_always_touch_are_left_out_and_listed(tmp_path):
         ({"obstacles": [Obstacle("wall", "box", (1e3, 1e3, 1e3), np.eye(4))]}, "link 'one' in 'wall'"),
     ],
 )
-def test_surroundings_that_a_link_never_leaves_are_refused(balls, surroundings, named):
+def test_inescapable_surroundings_refused(balls, surroundings, named):
+    """Surroundings that a link never leaves are refused."""
     with pytest.raises(RobotError, match=named):
         collision.from_urdf(balls, **surroundings)
     with pytest.raises(RobotError, match="no pose is free of collision"):
@@ -219,14 +221,15 @@ def test_lines_of_sight(arm, balls):
 @pytest.mark.parametrize("margin", [0.0, 0.01, 0.02, 0.05])
 @pytest.mark.parametrize("radius", [None, 0.03, 0.04, 0.05])
 @pytest.mark.parametrize("arm", ["ur5", "ur10", "panda", "lwr4plus"])
-def test_no_margin_makes_an_arm_infeasible_by_construction(arm, radius, margin):
+def test_no_margin_makes_arm_infeasible(arm, radius, margin):
     """A UR5's forearm and second wrist link are 0.0947 m apart in every posture, less two radii."""
     chain = load(arm)
     found = capsules.from_chain(chain, radius, margin=margin)
     assert found.free(random_joints(chain, 100, 1), margin).mean() > 0.3
 
 
-def test_an_obstacle_that_is_mostly_hit_is_an_obstacle_and_one_always_hit_is_refused():
+def test_only_constant_hits_are_refused():
+    """An obstacle that is mostly hit is an obstacle, and one always hit is refused."""
     chain = load("ur5")
     block = Obstacle("block", "box", (2.0, 2.0, 1.9), pose(position=[0, 0, 1.1]))
     found = capsules.from_chain(chain, obstacles=[block])
@@ -236,7 +239,8 @@ def test_an_obstacle_that_is_mostly_hit_is_an_obstacle_and_one_always_hit_is_ref
         capsules.from_chain(chain, obstacles=[Obstacle("block", "box", (2.0, 2.0, 1.9), pose(position=[0, 0, 1.0]))])
 
 
-def test_continuous_and_mimic_joints_move_the_shapes(tmp_path):
+def test_continuous_and_mimic_joints_move(tmp_path):
+    """Continuous and mimic joints move the shapes."""
     path = tmp_path / "arm.urdf"
     follow = axis("0 0 1") + '<mimic joint="a" multiplier="-2" offset="0.3"/>'
     path.write_text(

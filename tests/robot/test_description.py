@@ -40,7 +40,8 @@ def disturbed(chain: Chain) -> Chain:
 
 
 @pytest.mark.parametrize("name", library.names())
-def test_calibrated_tables_round_trip_as_tables(name, tmp_path):
+def test_calibrated_tables_round_trip(name, tmp_path):
+    """Calibrated tables round trip as tables."""
     chain = disturbed(load(name))
     path = description.write(tmp_path / "robot.toml", chain)
     assert same(description.read(path), chain) and same(load(tmp_path), chain)
@@ -54,7 +55,8 @@ def test_any_chain_round_trips(tmp_path):
     assert "[[element]]" in path.read_text()
 
 
-def test_a_table_without_proposed_beta_stays_so(tmp_path):
+def test_table_without_beta_stays_so(tmp_path):
+    """A table without proposed beta stays so."""
     chain = description.read(library.path("ur10"), propose_beta=False)
     path = description.write(tmp_path / "robot.toml", chain)
     assert description.read(path).names == chain.names
@@ -206,7 +208,7 @@ def test_loading(tmp_path, monkeypatch):
     [
         ("ur5x", r"no robot 'ur5x' \(did you mean 'ur5'\?\); give a path .* iiwa14, lwr4plus"),
         ("absent.urdf", r"no file absent\.urdf; give a path of a \.urdf"),
-        ("empty", "empty holds no result; give a URDF, .*; the library has"),
+        ("empty", "empty contains no result; give a URDF, .*; the library has"),
         ("arm.urdf.xacro", r"arm\.urdf\.xacro: xacro: syntax error"),
         ("arm.step", r"arm\.step is no robot file; give"),
     ],
@@ -220,7 +222,8 @@ def test_what_is_no_robot(robot, message, tmp_path, monkeypatch):
         load(robot)
 
 
-def test_base_and_tip_of_a_table_cannot_be_chosen():
+def test_table_has_fixed_base_and_tip():
+    """Base and tip of a table cannot be chosen."""
     assert load("ur5", "base", "tool0").name == "ur5"
     with pytest.raises(RobotError, match="its tip is 'tool0', not 'flange'; only a URDF allows to choose"):
         load("ur5", tip="flange")

@@ -70,7 +70,8 @@ def test_impossible_bodies_are_named(change, said):
         ({"lower": -360.0, "upper": 360.0}, "a: limits up to 360 rad in the robot's description; are they degrees?"),
     ],
 )
-def test_limits_of_zero_or_of_many_turns_are_remarks(limits, words):
+def test_limits_of_zero_or_turns_are_remarks(limits, words):
+    """Limits of zero or of many turns are remarks."""
     chain = load("ur5")
     joint = Joint("a", **limits)
     assert joint.velocity == np.inf and remarks(replace(chain, joints=(joint, *chain.joints[1:]))) == (words,)

@@ -53,7 +53,8 @@ def test_joint_jacobian_includes_followers(chain: Chain):
     np.testing.assert_allclose(together, forward(chain.with_values(chain.values + extra), q[None]), atol=1e-14)
 
 
-def test_joint_frames_move_with_their_joints_only():
+def test_frames_move_with_their_joints_only():
+    """Joint frames move with their joints only."""
     chain = CHAINS[0]
     q = random_joints(chain, 1, 5)
     moved = q.copy()

@@ -48,7 +48,8 @@ def test_row_is_the_documented_product():
     np.testing.assert_allclose(forward(chain, q[None])[0], wanted, atol=1e-15)
 
 
-def test_frames_agree_with_pinocchio_and_with_the_row():
+def test_frames_agree_with_pinocchio():
+    """Frames agree with Pinocchio and with the row."""
     chain = mdh.chain("rows", ROWS)
     q = random_joints(chain, 50)
     assert np.abs(pinocchio_poses(write_new(chain), chain, q) - forward(chain, q)).max() < 1e-12
@@ -75,7 +76,8 @@ def test_elements_names_owners_and_order():
         ((0.0, -0.04, HALF), ["beta2"]),
     ],
 )
-def test_beta_is_proposed_for_nearly_parallel_axes(alphas, proposed):
+def test_beta_is_proposed_near_parallel(alphas, proposed):
+    """Beta is proposed for nearly parallel axes."""
     rows = [Row(f"j{k}", k + 1, alpha=alpha, d=0.3) for k, alpha in enumerate(alphas)]
     assert [name for name in mdh.chain("p", rows).names if "beta" in name] == proposed
     assert not any("beta" in name for name in mdh.chain("p", rows, propose_beta=False).names)

@@ -11,7 +11,8 @@ from calib.robot.kinematics import forward
 
 
 @given(chains(inertias=True))
-def test_a_robot_file_returns_the_same_chain_to_the_last_bit(tmp_path_factory, chain):
+def test_robot_file_returns_the_same_chain(tmp_path_factory, chain):
+    """A robot file returns the same chain to the last bit."""
     back = description.read(description.write(tmp_path_factory.mktemp("robot") / "robot.toml", chain))
     assert (back.name, back.joints, back.base, back.tip) == (chain.name, chain.joints, chain.base, chain.tip)
     assert [e.name for e in back.elements] == [e.name for e in chain.elements]

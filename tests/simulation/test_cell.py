@@ -41,7 +41,8 @@ def study_poses(count: int, seed: int) -> np.ndarray:
     ("robot", "seeds"),
     [("lwr4plus", 10), *(pytest.param(name, 30, marks=pytest.mark.slow) for name in ("lwr4plus", "ur10"))],
 )
-def test_planted_truth_is_recovered_within_its_covariance(robot: str, seeds: int) -> None:
+def test_planted_truth_is_recovered(robot: str, seeds: int) -> None:
+    """The planted truth is recovered within its covariance."""
     # Prediction errors at unseen poses against what the covariance says of them: their mean square in sigmas is 1.
     q, ratios = random_joints(load(robot), 60, 1), []
     cell = rigid(perturbed_cell(load(robot), 3, SimulatedInstrument(encoder_sigma=0.0)))
@@ -55,7 +56,7 @@ def test_planted_truth_is_recovered_within_its_covariance(robot: str, seeds: int
     assert 0.8 < np.mean(ratios) < 1.2
 
 
-def test_hidden_part_has_the_size_of_the_paper() -> None:
+def test_hidden_part_has_size_of_paper() -> None:
     """Its size was chosen for this: the cell is as bad as the paper's, which says nothing of the fit."""
     cell = lwr4plus_cell()
     unseen = study_poses(400, 99)
@@ -64,7 +65,8 @@ def test_hidden_part_has_the_size_of_the_paper() -> None:
     assert 0.6 < np.median(errors) < 1.1  # paper, Table 3: 0.80 mm
 
 
-def test_stated_sigma_is_the_spread_of_repeated_measurements() -> None:
+def test_stated_sigma_is_the_spread() -> None:
+    """The stated sigma is the spread of repeated measurements."""
     bars = SimulatedInstrument(base_frame=np.eye(4), encoder_sigma=0.0)
     for instrument in (SimulatedInstrument(encoder_sigma=0.0), bars):
         cell = rigid(lwr4plus_cell(instrument))
@@ -79,7 +81,8 @@ def test_stated_sigma_is_the_spread_of_repeated_measurements() -> None:
             np.testing.assert_allclose(turns.std(axis=0), measured.sigma_rotation[first], rtol=0.06)
 
 
-def test_base_leds_measure_the_arm_from_its_base() -> None:
+def test_base_leds_measure_from_the_base() -> None:
+    """Base LEDs measure the arm from its base."""
     quiet = SimulatedInstrument(position_sigma=1e-12, orientation_sigma=1e-12, encoder_sigma=0.0, base_frame=np.eye(4))
     cell = lwr4plus_cell(quiet)
     measured = measure(cell, study_poses(5, 2), 0)
@@ -87,7 +90,8 @@ def test_base_leds_measure_the_arm_from_its_base() -> None:
     np.testing.assert_allclose(measured.position, seen[:, :3, 3], atol=1e-9)
 
 
-def test_drift_and_outliers_are_where_they_are_said_to_be() -> None:
+def test_drift_and_outliers_are_where_said() -> None:
+    """Drift and outliers are where they are said to be."""
     q = study_poses(200, 3)
     cell = lwr4plus_cell(SimulatedInstrument(encoder_sigma=0.0))
     plain = measure(cell, q, 4).position
@@ -108,7 +112,8 @@ def test_same_seed_same_measurement() -> None:
     assert np.abs(one - other).max() > 1e-6
 
 
-def test_table_2_as_frames_and_arm_is_table_2_as_one_product() -> None:
+def test_table_2_frames_equal_its_product() -> None:
+    """Table 2 as frames and arm is Table 2 as one product."""
     _, table = lwr4plus.table_2()
     q = random_joints(lwr4plus.nominal_chain(), 5, 0)
     expected = np.broadcast_to(lwr4plus.transform(*table[0]), (5, 4, 4))

@@ -17,7 +17,8 @@ CELL = virtual_cell("lwr4plus", 0)
 ARM = CELL.truth.chain
 
 
-def test_effects_of_the_ladder_hold_no_more_than_a_third_of_the_gear_errors() -> None:
+def test_ladder_holds_little_of_gear_errors() -> None:
+    """Effects of the ladder hold no more than a third of the gear errors."""
     q = random_joints(ARM, 2500, 3)
     torque = gravity_torques(ARM, q)
     moved = displacements(PositionErrors(gear=1e-3), ARM, q, torque, np.inf)[ARM.moving]
@@ -30,7 +31,8 @@ def test_effects_of_the_ladder_hold_no_more_than_a_third_of_the_gear_errors() ->
     assert np.all(np.var(moved.T - fitted, axis=0) > 0.65 * np.var(moved.T, axis=0))
 
 
-def test_position_errors_are_those_of_a_real_arm() -> None:
+def test_position_errors_are_realistic() -> None:
+    """Position errors are those of a real arm."""
     q = np.repeat(random_joints(ARM, 2, 1), 2, axis=0)[[0, 2, 1, 3]]  # there and back: every pose from both sides
     torque = gravity_torques(ARM, q)
     slack = displacements(PositionErrors(backlash=1e-4), ARM, q[[0, 1, 2, 1]], torque, np.inf)[ARM.moving]
@@ -47,14 +49,16 @@ def test_position_errors_are_those_of_a_real_arm() -> None:
     assert np.all(droop @ down > 0.19e-4) and np.all(np.linalg.norm(droop, axis=1) < 1.01e-4)
 
 
-def test_nothing_is_added_where_nothing_is_hidden() -> None:
+def test_nothing_hidden_adds_nothing() -> None:
+    """Nothing is added where nothing is hidden."""
     q = random_joints(ARM, 20, 4)
     plain = lwr4plus_cell()
     assert not displacements(plain.unmodelled, ARM, q, gravity_torques(ARM, q), 0.0).any()
     assert plain.unmodelled.note == "" and "backlash" in CELL.note
 
 
-def test_friction_with_memory_depends_on_the_way_and_takes_energy() -> None:
+def test_friction_depends_on_the_way() -> None:
+    """Friction with memory depends on the way and takes energy."""
     angle = 0.05 * np.sin(np.linspace(0.0, 6.0 * np.pi, 6001))[:, None]
     torque = memory(angle, np.array([2.0]))[:, 0]
     assert np.abs(torque).max() <= 2.0 + 1e-12

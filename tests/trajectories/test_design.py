@@ -22,7 +22,7 @@ from calib.trajectories.design.starts import random_start
 from calib.trajectories.design.verify import dense_motion, ensured, verify_motion
 from calib.trajectories.errors import BadInput, NotExciting, NothingFeasible
 from calib.trajectories.fourier import fourier_family
-from calib.trajectories.places import Clearance, Workspace
+from calib.trajectories.workspace_limits import Clearance, Workspace
 
 BASE, CHI, CHAIN = arm.lwr()
 EFFORT = np.array([joint.effort for joint in CHAIN.joints])
@@ -50,7 +50,8 @@ def designed() -> tuple[ExcitationProblem, SearchResult]:
     return spot, design(spot, starts=1, evaluations=60, seed=1)
 
 
-def test_the_motion_found_keeps_every_limit_everywhere_by_pinocchio_too():
+def test_motion_keeps_every_limit():
+    """The motion found keeps every limit everywhere, by Pinocchio, too."""
     spot, found = designed()
     found, proof = ensured(spot, found)
     assert proof.feasible and found.merit < np.log(60.0)
@@ -68,7 +69,8 @@ def test_the_motion_found_keeps_every_limit_everywhere_by_pinocchio_too():
     assert least.margin == pytest.approx((EFFORT - np.abs(torque))[:, int(least.label[6]) - 1].min(), abs=0.5)
 
 
-def test_the_same_seed_gives_the_same_motion_also_through_a_map():
+def test_same_seed_gives_the_same_motion():
+    """The same seed gives the same motion, also through a map."""
     spot = problem(samples=30)
     found = design(spot, starts=1, evaluations=30, seed=1)
     with ThreadPoolExecutor(2) as pool:
@@ -95,7 +97,8 @@ def test_the_search_beats_random_motions():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["auglag", "mma"])
-def test_the_other_methods_improve_their_start_too(method):
+def test_other_methods_improve_their_start(method):
+    """The other methods improve their start, too."""
     spot = problem()
     run = one_start(spot, 240, method, 1, 0)
     assert isinstance(run, SearchResult) and run.merit < run.history[0] - 1.0
@@ -126,7 +129,8 @@ def test_a_hard_goal_out_of_reach_is_named():
         design(spot, starts=1, evaluations=60)
 
 
-def test_a_free_period_is_shortened_down_to_a_limit():
+def test_free_period_is_shortened_to_limit():
+    """A free period is shortened down to a limit."""
     spot = problem(
         goals=(AttainmentGoal(Duration(), 10.0), AttainmentGoal(Excitation("cond", "normalised"), 15.0, 0.0)),
         stretch=(0.4, 2.0),
@@ -139,7 +143,8 @@ def test_a_free_period_is_shortened_down_to_a_limit():
 
 
 @pytest.mark.slow
-def test_the_next_motion_complements_what_was_recorded():
+def test_next_motion_complements_earlier():
+    """The next motion complements what was recorded."""
     spot, first = designed()
     motion = spot.basis().motion(first.x)
     W = BASE.regressor(motion.q, motion.v, motion.a).transpose(1, 0, 2).reshape(-1, 64)
@@ -150,7 +155,8 @@ def test_the_next_motion_complements_what_was_recorded():
 
 
 @pytest.mark.slow
-def test_single_objectives_propose_goals_and_a_front_trades_them():
+def test_single_objectives_propose_goals():
+    """Single objectives propose goals, and a front trades them."""
     spot, first = designed()
     motion = spot.basis().motion(first.x)
     begin = SLACK.evaluate(motion, BASE.regressor(motion.q, motion.v, motion.a)).value
@@ -181,14 +187,16 @@ def test_domination():
     ]
 
 
-def test_nothing_feasible_names_the_constraint_and_the_excess():
+def test_infeasibility_names_constraint():
+    """Nothing feasible names the constraint and the excess."""
     with pytest.raises(NothingFeasible, match=r"in 1 start: .* workspace limit \(tool lowest\) by 0\.\d+ m") as caught:
         design(problem(constraints=limits(lowest=1.5), samples=20), starts=1, evaluations=10)
     assert caught.value.constraint == "workspace" and 0.6 < caught.value.excess < 1.0
     pickle.loads(pickle.dumps(caught.value))
 
 
-def test_a_start_outside_the_limits_is_infeasible_by_what_it_lacks():
+def test_start_outside_is_infeasible():
+    """A start outside the limits is infeasible by what it lacks."""
     start = np.array([0.0, 0.8, 0.0, -1.0, 0.0, 2.3, 0.0])  # joint 6 may go to 2.094
     kept = box_limits(CHAIN.lower, CHAIN.upper, VELOCITY)
     spot = problem(family=fourier_family(4, 15.0, 7, start=start), constraints=kept, samples=10)
@@ -196,7 +204,8 @@ def test_a_start_outside_the_limits_is_infeasible_by_what_it_lacks():
         design(spot, starts=1, evaluations=10)
 
 
-def test_a_locked_joint_leaves_columns_without_information():
+def test_locked_joint_leaves_no_information():
+    """A locked joint leaves columns without information."""
     with pytest.raises(NotExciting, match="zero along the whole motion"):
         design(problem(family=fourier_family((4, 4, 0, 4, 4, 4, 4), 15.0)), starts=1, evaluations=30)
 
@@ -217,7 +226,8 @@ def test_interrupting_keeps_the_best_so_far():
     assert found.interrupted and len(calls) == 80 and found.merit < found.history[0]
 
 
-def test_verification_finds_what_happens_between_samples():
+def test_verification_sees_between_samples():
+    """Verification finds what happens between samples."""
     family = fourier_family(8, 8.0, 1)
     x = family.random(np.random.default_rng(0), np.zeros(1), np.ones(1))
     peak = np.abs(family.evaluate(x, np.linspace(0, 8, 100_001), 1)).max()
@@ -231,7 +241,8 @@ def test_verification_finds_what_happens_between_samples():
 
 
 @pytest.mark.slow
-def test_a_motion_that_breaks_its_limits_is_searched_again():
+def test_broken_limits_are_searched_again():
+    """A motion that breaks its limits is searched again."""
     spot, found = designed()
     larger = replace(found, x=1.1 * found.x)
     assert not verify_motion(spot.family, larger.x, spot.constraints).feasible
@@ -240,7 +251,7 @@ def test_a_motion_that_breaks_its_limits_is_searched_again():
 
 
 @pytest.mark.slow
-def test_a_wall_thinner_than_a_step_is_not_jumped_over():
+def test_thin_wall_is_not_jumped_over():
     """Joint 1 must stay on one side of 0.3 rad, which samples 0.6 s apart do not see."""
     wall = Clearance(
         lambda q: np.abs(q[:, :1] - 0.3) - 0.02, lambda q: np.sign(q[:, :1, None] - 0.3) * np.eye(1, 7),

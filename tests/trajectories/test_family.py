@@ -24,7 +24,8 @@ def drawn(family, seed: int = 0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=IDS)
-def test_each_order_is_the_derivative_of_the_one_before(family):
+def test_orders_are_successive_derivatives(family):
+    """Each order is the derivative of the one before."""
     x, t = drawn(family), np.array([0.37, 1.9, 3.61])
     orders = family.basis(t).motion(x).orders
     for order in range(3):
@@ -36,7 +37,8 @@ def test_each_order_is_the_derivative_of_the_one_before(family):
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=IDS)
-def test_adjoint_is_the_derivative_by_the_variables(family):
+def test_adjoint_is_derivative_by_variables(family):
+    """The adjoint is the derivative by the variables."""
     basis = family.basis(sample_times(4.0, 11))
     weights = np.random.default_rng(1).normal(size=(4, 11, 3))
 
@@ -58,7 +60,8 @@ def test_a_given_start_is_kept():
     assert np.allclose(family.basis(np.zeros(1)).motion(drawn(family)).q, [[0.3, -1.0, 2.0]])
 
 
-def test_equation_23_term_by_term_agrees_with_the_tables():
+def test_equation_23_agrees_with_tables():
+    """Equation 23, term by term, agrees with the tables."""
     family = FAMILIES[0]
     x, t = drawn(family), np.linspace(0, 4, 17)
     for order, values in enumerate(family.basis(t).motion(x).orders):
@@ -66,7 +69,8 @@ def test_equation_23_term_by_term_agrees_with_the_tables():
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=IDS)
-def test_evaluation_without_the_tables_agrees(family):
+def test_evaluation_without_tables_agrees(family):
+    """Evaluation without the tables agrees."""
     x, t = drawn(family), np.linspace(0, 4, 17)
     for order, values in enumerate(family.basis(t).motion(x).orders):
         assert np.allclose(family.evaluate(x, t, order), values, atol=1e-9 * max(1, np.abs(values).max()))
@@ -74,7 +78,8 @@ def test_evaluation_without_the_tables_agrees(family):
 
 @pytest.mark.parametrize("family", FAMILIES, ids=IDS)
 @pytest.mark.parametrize("order", [1, 2, 3])
-def test_the_bound_on_a_derivative_holds_and_is_not_idle(family, order):
+def test_derivative_bound_is_not_idle(family, order):
+    """The bound on a derivative holds and is not idle."""
     for seed in range(5):
         x = drawn(family, seed)
         peak = np.abs(family.basis(np.linspace(0, 4, 4001)).motion(x).orders[order]).max(axis=0)
@@ -84,7 +89,8 @@ def test_the_bound_on_a_derivative_holds_and_is_not_idle(family, order):
 
 
 @pytest.mark.parametrize("family", FAMILIES, ids=IDS)
-def test_variables_are_read_back_from_coefficients(family):
+def test_variables_come_from_coefficients(family):
+    """Variables are read back from their coefficients."""
     x = drawn(family)
     assert np.allclose(family.variables(family.coefficients(x)), x, atol=1e-12)
 

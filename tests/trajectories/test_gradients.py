@@ -19,7 +19,7 @@ from calib.trajectories.design.objectives import (  # fmt: skip
 from calib.trajectories.design.problem import AttainmentGoal, ExcitationProblem, evaluate, exact_values
 from calib.trajectories.errors import BadInput, NotExciting
 from calib.trajectories.fourier import fourier_family
-from calib.trajectories.places import Clearance, Workspace
+from calib.trajectories.workspace_limits import Clearance, Workspace
 
 BASE, CHI, CHAIN = arm.lwr(0.3)
 LIMITS = np.array([joint.effort for joint in CHAIN.joints])
@@ -112,7 +112,8 @@ def test_constraints(constraint):
     check(f, evaluate(spot, basis, y, sharp).rows @ directions, np.zeros(6), tolerance=1e-6)
 
 
-def test_extra_times_count_for_constraints_alone():
+def test_extra_times_serve_constraints_only():
+    """Extra times count for constraints alone."""
     spot = problem(OBJECTIVES[0], (constraints()[0], constraints()[4]), stretch=(0.5, 2.0))
     closer = replace(spot, extra=np.array([0.37, 1.21, 1.22]), tightening=np.array([0.003, 0.1]))
     y, sharp = drawn(1), (8.0, 20.0)
@@ -125,7 +126,8 @@ def test_extra_times_count_for_constraints_alone():
 
 
 @pytest.mark.parametrize("constraint", constraints(), ids=lambda c: c.name)
-def test_the_smoothed_constraint_lies_above_the_largest_value(constraint):
+def test_smoothed_constraint_lies_above(constraint):
+    """The smoothed constraint lies above the largest value."""
     motion = FAMILY.basis(np.linspace(0, 6, 60, endpoint=False)).motion(drawn())
     largest = (constraint.values(motion) / constraint.scale).max(axis=0)
     for sharpness in (20.0, 400.0):
@@ -136,7 +138,8 @@ def test_the_smoothed_constraint_lies_above_the_largest_value(constraint):
         assert excess == pytest.approx(largest.max())
 
 
-def test_condition_numbers_agree_with_numpy_and_the_smoothed_ones_bound_them():
+def test_condition_numbers_agree_with_numpy():
+    """Condition numbers agree with NumPy, and the smoothed ones bound them."""
     motion = FAMILY.basis(np.linspace(0, 6, 60, endpoint=False)).motion(drawn())
     Y = BASE.regressor(motion.q, motion.v, motion.a)
     W = Y.transpose(1, 0, 2).reshape(-1, 64)
@@ -152,7 +155,8 @@ def test_condition_numbers_agree_with_numpy_and_the_smoothed_ones_bound_them():
     assert condition_numbers(Y, existing=existing)["raw"] == pytest.approx(np.linalg.cond(stacked), rel=1e-6)
 
 
-def test_the_slack_is_what_the_paper_minimises_up_to_the_stated_smoothing():
+def test_slack_is_what_paper_minimises():
+    """The slack is what the paper minimises, up to the stated smoothing."""
     motion = FAMILY.basis(np.linspace(0, 6, 60, endpoint=False)).motion(drawn())
     Y = BASE.regressor(motion.q, motion.v, motion.a)
     exact = np.mean(1 - np.abs((Y @ CHI)[:, 5:]) / LIMITS[5:])
@@ -160,7 +164,8 @@ def test_the_slack_is_what_the_paper_minimises_up_to_the_stated_smoothing():
     assert exact <= slack <= exact + 1e-3
 
 
-def test_coverage_is_zero_where_every_range_is_visited_enough():
+def test_coverage_is_zero_where_visited():
+    """Coverage is zero where every range is visited enough."""
     coverage = FrictionCoverage(np.array([0.4]), np.array([0.8]), wanted=0.1)
     motion = fourier_family(1, 6.0, 1, rest=False).basis(np.linspace(0, 6, 600, endpoint=False))
     fast = motion.motion(np.array([0.0, 1.0, 0.0]) * 6 / 2 / np.pi)

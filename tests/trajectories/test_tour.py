@@ -28,13 +28,16 @@ def test_no_matrix_of_times():
             tour(wrong)
 
 
-def test_moves_last_as_long_as_their_slowest_joint():
+def test_moves_last_as_their_slowest_joint():
+    """Moves last as long as their slowest joint."""
     v, a = np.array([1.0, 0.5]), np.array([2.0, 1.0])
     assert move_times(np.zeros(2), np.array([2.0, 0.0]), v, a) == pytest.approx(2.0 + 0.5)
     assert move_times(np.zeros(2), np.array([0.02, 0.09]), v, a) == pytest.approx(2 * np.sqrt(0.09))
 
 
-def test_a_way_leads_around_a_wall_with_a_gap():
+def test_way_leads_around_a_wall():
+    """A way leads around a wall with a gap."""
+
     def clear(q: np.ndarray) -> np.ndarray:
         return (np.abs(q[:, 0]) > 0.1) | (q[:, 1] > 0.7)
 

@@ -37,7 +37,8 @@ from calib.identification.rows import Case
 # Of all noise drawn here; other than the seeds by which logs are simulated, whose noise must not be drawn again.
 SEED = 20_190_613
 # Control periods per sample of a noisy run, and Simpson's weights of the three samples of a period.
-HALF, SIMPSON = 0.5, (1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0)
+HALF = 0.5
+SIMPSON = [1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0]
 # Share of noise in the loop below which it is not simulated: of its effect on a sign it is less than 1 % (our choice).
 MIN_SHARE = 0.1
 # Samples by which torques may follow positions, beyond the controller's delay.
@@ -101,22 +102,24 @@ def mean_signs(
         columns: function of a case that returns its columns of signs.
         run: the noise-free run of the loop, at the recording's rate.
     """
-    parts = []
-    for way in (1.0, -1.0):
-        q, speeds = run.q, [run.v]
+    true_means = []
+    recorded_means = []
+    for factor in (1.0, -1.0):
+        q, speeds, weights = run.q, [run.v], [1.0]
         if np.any(noise.loop):
-            q, speeds = _in_loop(plant, case, loop, run, way * noise.loop)
-        drawn = np.random.default_rng([SEED, 1]).normal(size=q.shape)
-        seen = simulated_case(case, replace(run, q=q + way * noise.log * drawn), loop)
+            q, speeds = _in_loop(plant, case, loop, run, factor * noise.loop)
+            weights = SIMPSON
+        error = factor * noise.log * np.random.default_rng([SEED, 1]).normal(size=q.shape)
+        recorded = simulated_case(case, replace(run, q=q + error), loop)
         samples = simulated_samples(case, run.t, loop)
-        weights = SIMPSON if len(speeds) > 1 else (1.0,)
-        true = np.zeros(1)
+        recorded_columns = columns(recorded)
+        true_columns = np.zeros_like(recorded_columns)
         for weight, speed in zip(weights, speeds):
-            moved = replace(seen, motion=replace(seen.motion, v=speed[samples]))
-            true = true + weight * columns(moved)
-        parts.append((true, columns(seen)))
-    (first, first_seen), (second, second_seen) = parts
-    return 0.5 * (first + second), 0.5 * (first_seen + second_seen)
+            motion = replace(recorded.motion, v=speed[samples])
+            true_columns += weight * columns(replace(recorded, motion=motion))
+        true_means.append(0.5 * true_columns)
+        recorded_means.append(0.5 * recorded_columns)
+    return true_means[0] + true_means[1], recorded_means[0] + recorded_means[1]
 
 
 def _in_loop(

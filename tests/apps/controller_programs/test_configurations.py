@@ -67,7 +67,7 @@ def m20ia(request):
     return chain, Goal(Installation(chain), 6, chain.lower, chain.upper)
 
 
-def test_a_real_controllers_configuration_is_that_of_its_joints(m20ia):
+def test_real_configuration_matches_joints(m20ia):
     """CURPOS.DG of an R-30iA: joints 86.75 -45.63 -10.99 56.19 -81.55 -94.01, CFG N U T, 0, 0, 0."""
     controller = controller_named("fanuc")
     q = controller.described(np.radians([[86.75, -45.63, -10.99, 56.19, -81.55, -94.01]]))
@@ -77,7 +77,8 @@ def test_a_real_controllers_configuration_is_that_of_its_joints(m20ia):
     assert flipped is not None and not flipped.holds(controller, m20ia[0], q)[0]
 
 
-def test_turns_choose_among_postures_a_turn_apart(m20ia):
+def test_turns_choose_among_postures(m20ia):
+    """Turns choose among postures a turn apart."""
     chain, goal = m20ia
     controller = controller_named("fanuc")
     q = np.radians([10.0, 20.0, 10.0, 30.0, -60.0, 200.0])
@@ -89,7 +90,8 @@ def test_turns_choose_among_postures_a_turn_apart(m20ia):
         assert answer.reasons == ("",) and np.degrees(answer.q[0, 5]) == pytest.approx(expected, abs=1e-4)
 
 
-def test_a_configuration_that_the_pose_does_not_have_is_said(m20ia):
+def test_impossible_configuration_is_said(m20ia):
+    """A configuration that the pose does not have is said."""
     chain, goal = m20ia
     q = np.radians([0.0, 60.0, 60.0, 0.0, -60.0, 0.0])
     q[1] = chain.upper[1]  # stretched ahead and down: behind axis 1 nothing reaches that
@@ -99,7 +101,8 @@ def test_a_configuration_that_the_pose_does_not_have_is_said(m20ia):
     assert "is no posture at this pose" in answer.reasons[0] and "before axis 1" in answer.reasons[0]
 
 
-def test_a_start_that_contradicts_the_configuration_is_said(m20ia):
+def test_contradicting_start_is_said(m20ia):
+    """A start that contradicts the configuration is said."""
     chain, goal = m20ia
     controller = controller_named("fanuc")
     q = np.radians([10.0, 20.0, 10.0, 30.0, -60.0, 20.0])
@@ -111,7 +114,8 @@ def test_a_start_that_contradicts_the_configuration_is_said(m20ia):
     assert answer.contradicted[0] and answer.reasons == ("",)
 
 
-def test_arms_without_a_spherical_wrist_have_no_configuration(m20ia):
+def test_configuration_needs_spherical_wrist(m20ia):
+    """Arms without a spherical wrist have no configuration."""
     assert (
         has_spherical_wrist(m20ia[0])
         and not has_spherical_wrist(load("ur5"))

@@ -31,10 +31,11 @@ def fit(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, np.ndarray, np.
     return folder / "fit", seen.q, seen.position
 
 
-def test_the_frames_of_the_nominal_arm_fit_as_its_metrics_say(fit):
+def test_nominal_frames_fit_as_metrics_say(fit):
+    """The frames of the nominal arm fit as its metrics say."""
     folder, q, seen = fit
     out = delivery_text(folder, controller_named("ros2"))
-    assert "Its axes are not mastered" in out and "Mastering, " not in out
+    assert "Users cannot master the axes" in out and "Mastering, " not in out
     form = " ".join(["xyz", *[NUMBER] * 3]) + ", rpy " + " ".join([NUMBER] * 3)
     found = [from_xyz_rpy(v[:3], v[3:]) for v in np.array(re.findall(form, out), float)]
     points = (invert(found[1]) @ forward(load("ur5"), q) @ found[0])[:, :3, 3]
@@ -42,7 +43,8 @@ def test_the_frames_of_the_nominal_arm_fit_as_its_metrics_say(fit):
     assert rms == pytest.approx(FitFolder(folder).metrics().fit.nominal.main.rms, rel=1e-4)
 
 
-def test_offsets_and_the_frames_beside_them_fit_better(fit):
+def test_offsets_and_frames_fit_better(fit):
+    """Offsets, and the frames beside them, fit better."""
     folder, q, seen = fit
     out = delivery_text(folder, controller_named("krl"))
     mastered = out.partition("Mastering, ")[2]
@@ -56,10 +58,11 @@ def test_offsets_and_the_frames_beside_them_fit_better(fit):
     assert rms == pytest.approx(whole.calibrated.main.rms, rel=1e-3) and rms < 0.9 * whole.nominal.main.rms
 
 
-def test_every_controller_says_what_it_takes_and_what_is_closed(fit):
+def test_controllers_say_what_they_take(fit):
+    """Every controller says what it takes and what is closed."""
     for name, each in controllers().items():
         out = delivery_text(fit[0], each)
-        assert "It takes: " in out and "It does not: " in out and "instrument seen: " in out, name
+        assert "The controller accepts: " in out and "It does not accept: " in out and "instrument seen: " in out, name
 
 
 def test_signs_and_coupled_axes_are_undone():

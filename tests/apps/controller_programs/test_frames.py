@@ -76,7 +76,8 @@ def placed(line: str) -> np.ndarray:
     return pose(from_xyz_rpy([0, 0, 0], np.radians(values[3:]))[:3, :3], 1e-3 * values[:3])
 
 
-def test_a_fanuc_gets_its_workpiece_in_world_and_its_tool_in_the_faceplate(fitted):
+def test_fanuc_workpiece_and_tool_frames(fitted):
+    """A Fanuc gets its workpiece in World and its tool in the faceplate."""
     folder, tool, workpiece = fitted
     lines = delivery_text(folder, controller_named("fanuc")).split("\n")
     at = next(k for k, line in enumerate(lines) if "UFRAME[1]" in line)
@@ -100,7 +101,8 @@ def test_a_stated_world_counts_first(fitted, tmp_path, capsys):
         assert said in capsys.readouterr().err
 
 
-def test_where_the_base_is_not_known_no_number_is_printed(fitted, tmp_path):
+def test_unknown_base_prints_no_number(fitted, tmp_path):
+    """Where the base is not known, no number is printed."""
     folder = tmp_path / "f"
     shutil.copytree(fitted[0], folder)
     for path in (folder / "robot.toml", folder / "robot.urdf"):
@@ -111,7 +113,8 @@ def test_where_the_base_is_not_known_no_number_is_printed(fitted, tmp_path):
     assert not any("UFRAME[1]" in line for line in lines) and any("UTOOL[1]" in line for line in lines)
 
 
-def test_a_base_that_moves_is_not_the_controllers():
+def test_moving_base_is_not_the_controllers():
+    """A base that moves is not the controller's."""
     moving = changed(
         ('<joint name="base_link-base" type="fixed">' + BASE, ""),
         (
@@ -124,7 +127,8 @@ def test_a_base_that_moves_is_not_the_controllers():
     assert frame.pose is None and "'base' moves with joint 'slide'" in frame.basis and "--world" in frame.basis
 
 
-def test_a_base_elsewhere_than_the_controllers_rule_is_warned_of():
+def test_base_against_the_rule_is_warned_of():
+    """A base elsewhere than the controller's rule puts it is warned of."""
     frame = base_frame(
         controller_named("fanuc"), arm_of(changed(('xyz="0 0 0.525"/><parent', 'xyz="0 0 0.1"/><parent')))
     )
@@ -132,7 +136,8 @@ def test_a_base_elsewhere_than_the_controllers_rule_is_warned_of():
     assert "0.525 m above base_link" in frame.warning
 
 
-def test_a_flange_alone_is_turned_as_the_controllers():
+def test_lone_flange_turned_as_controllers():
+    """A flange alone is turned as the controller's."""
     bare = changed(('<link name="tool0"/>', '<link name="hand"/>'), ('<child link="tool0"/>', '<child link="hand"/>'))
     whole, frame = (flange_frame(controller_named("fanuc"), arm_of(source)) for source in (FANUC.read_text(), bare))
     assert whole.pose is not None and frame.pose is not None
@@ -140,18 +145,21 @@ def test_a_flange_alone_is_turned_as_the_controllers():
     np.testing.assert_allclose(tips[1] @ frame.pose, tips[0] @ whole.pose, atol=1e-12)
 
 
-def test_a_tool_frame_across_the_last_axis_is_no_flange():
+def test_tool_across_last_axis_is_no_flange():
+    """A tool frame across the last axis is no flange."""
     crooked = changed(('rpy="3.141592653589793 -1.5707963267948966 0"', 'rpy="0 0 0"'))
     frame = flange_frame(controller_named("fanuc"), arm_of(crooked))
     assert frame.pose is None and "not along the last axis" in frame.basis and "--flange" in frame.basis
 
 
-def test_every_controller_says_where_its_frames_stand_and_by_whom():
+def test_controllers_say_where_frames_stand():
+    """Every controller says where its frames stand, and who states it."""
     for name, controller in controllers().items():
         assert controller.base and controller.flange and controller.frames and controller.base_at, name
 
 
-def test_a_stated_frame_needs_three_or_six_numbers():
+def test_stated_frame_needs_3_or_6_numbers():
+    """A stated frame needs three or six numbers."""
     np.testing.assert_array_equal(stated_frame("1,2,3", "--world"), from_xyz_rpy([1, 2, 3], [0, 0, 0]))
     assert stated_frame(None, "--world") is None
     for words in ("1,2", "1,2,3,4", "x,y,z", "1,2,inf"):
@@ -162,7 +170,7 @@ def test_a_stated_frame_needs_three_or_six_numbers():
 MAKERS = {"fanuc": "fanuc", "abb": "rapid", "kroshu": "krl", "kuka": "krl", "motoman": "yaskawa", "universal": "ur"}
 
 
-def test_the_rules_are_where_the_makers_descriptions_have_the_link_base(data):
+def test_rules_match_makers_descriptions(data):
     """Of all public arms with a link `base`: the controller's rule puts its base there, too."""
     folder = data / "public_arms"
     if not folder.is_dir():

@@ -46,7 +46,8 @@ def fanuc(*poses: str, lines: str = "   1:J P[1] 10% FINE ;\n") -> str:
     return "/PROG A\n/MN\n" + lines + "/POS\n" + "".join(poses) + "/END\n"
 
 
-def test_a_fanucs_frames_and_configuration_are_read(tmp_path):
+def test_fanuc_frames_and_configuration(tmp_path):
+    """A Fanuc's frames and configuration are read."""
     text = fanuc(FANUC_POSE.format(1, 0, 1, "N U T, 0, 0, 0"), FANUC_POSE.format(2, 1, 3, "F D B, 0, 0, -1"))
     frames = read(tmp_path, "a.ls", text, backup=BACKUP)
     expected = Setting("UTOOL[1]", "UFRAME[0]", "N U T 0 0 0"), Setting("UTOOL[3]", "UFRAME[1]", "F D B 0 0 -1")
@@ -57,12 +58,14 @@ def test_a_fanucs_frames_and_configuration_are_read(tmp_path):
 
 
 @pytest.mark.parametrize(("lines", "tool"), [("UTOOL_NUM=3 ;\n", "UTOOL[3]"), ("UTOOL_NUM=3 ;\nUTOOL_NUM=4 ;\n", "")])
-def test_a_fanucs_active_frame_is_the_only_one_that_is_selected(tmp_path, lines, tool):
+def test_fanuc_selects_its_active_frame_only(tmp_path, lines, tool):
+    """A Fanuc's active frame is the only one that is selected."""
     frames = read(tmp_path, "a.ls", fanuc(FANUC_POSE.format(1, "F", "F", "N U T, 0, 0, 0"), lines=lines))
     assert frames.settings == (Setting(tool, "", "N U T 0 0 0"),)
 
 
-def test_frames_that_are_given_twice_with_other_numbers_are_refused(tmp_path):
+def test_frames_stated_twice_are_refused(tmp_path):
+    """Frames that are stated twice, with other numbers, are refused."""
     line = "UTOOL[1]: X {}, Y 0.0, Z 0.0 mm, W 0.0, P 0.0, R 0.0 deg\n"
     text = fanuc(FANUC_POSE.format(1, 0, 1, "N U T, 0, 0, 0"))
     with pytest.raises(UsageError, match=r"UTOOL\[1\] is given twice"):
@@ -93,7 +96,8 @@ END
 """
 
 
-def test_a_kukas_frames_are_those_selected_before_the_motion_or_the_points_own(tmp_path):
+def test_kuka_frames_of_selection_or_point(tmp_path):
+    """A KUKA's frames are those selected before the motion, or the point's own."""
     frames = read(tmp_path, "b.src", KRL)
     assert [(setting.tool, setting.user) for setting in frames.settings] == [
         ("TOOL_DATA[2]", "$BASE of line 4"),
@@ -130,7 +134,8 @@ ENDMODULE
 """
 
 
-def test_an_abbs_frames_are_those_of_the_moves_that_use_the_target(tmp_path):
+def test_abb_frames_are_those_of_its_moves(tmp_path):
+    """An ABB's frames are those of the moves that use the target."""
     frames = read(tmp_path, "c.mod", RAPID)
     assert frames.settings == (
         Setting("tgrip", "w1", "0 -1 0 1"),
@@ -142,12 +147,14 @@ def test_an_abbs_frames_are_those_of_the_moves_that_use_the_target(tmp_path):
 
 
 @pytest.mark.parametrize(("old", "new"), [("tGrip:=[TRUE", "tGrip:=[FALSE"), ("w1:=[FALSE", "w1:=[TRUE")])
-def test_an_abbs_frame_on_the_other_side_is_refused(tmp_path, old, new):
+def test_abb_frame_on_other_side_is_refused(tmp_path, old, new):
+    """An ABB's frame on the other side is refused."""
     with pytest.raises(UsageError, match="robhold"):
         read(tmp_path, "c.mod", RAPID.replace(old, new))
 
 
-def test_a_urs_tool_is_the_one_set_before_the_move(tmp_path):
+def test_ur_tool_is_the_one_set_before_move(tmp_path):
+    """A UR's tool is the one set before the move."""
     text = """def d():
   movel(p[0.4,0.1,0.3,0,3.14,0], a=1)
   # set_tcp(p[9,9,9,0,0,0])

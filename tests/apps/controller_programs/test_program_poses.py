@@ -58,7 +58,8 @@ def run(capsys, *words: object) -> tuple[int, str, str]:
     return code, out, err
 
 
-def test_poses_are_those_moved_to_the_arms_base_by_hand(fitted, tmp_path, capsys):
+def test_poses_equal_those_moved_by_hand(fitted, tmp_path, capsys):
+    """Poses are those moved to the arm's base by hand."""
     folder, chain = fitted
     (tmp_path / "p.ls").write_text(program(chain))
     (tmp_path / "frames.txt").write_text(f"{line('UTOOL[2]', TOOL)}\n{line('UFRAME[1]', USER)}\n")
@@ -84,7 +85,8 @@ def test_poses_are_those_moved_to_the_arms_base_by_hand(fitted, tmp_path, capsys
     assert np.abs(expected - read_program(tmp_path / "p.ls").poses()).max() > 1e-4, "there was something to compensate"
 
 
-def test_what_the_program_does_not_say_is_named_or_stated(fitted, tmp_path, capsys):
+def test_gaps_of_program_named_or_stated(fitted, tmp_path, capsys):
+    """What the program does not say is named, or stated."""
     folder, chain = fitted
     path, sent = tmp_path / "p.ls", tmp_path / "sent.ls"
     path.write_text(program(chain))
@@ -97,13 +99,14 @@ def test_what_the_program_does_not_say_is_named_or_stated(fitted, tmp_path, caps
     (tmp_path / "frames.txt").write_text(line("UTOOL[2]", TOOL))
     words = "--frames", tmp_path / "frames.txt", "--tool", "0,0,0.1", *statements[2:]
     code, _, err = run(capsys, folder, path, "--out", tmp_path / "no.ls", *words)
-    assert code == 2 and "--tool says 0, 0, 100 mm" in err and "in the program's files" in err
+    assert code == 2 and "--tool states 0, 0, 100 mm" in err and "in the program's files" in err
     path.write_text(program(chain, "UF : F, UT : F"))
     code, _, err = run(capsys, folder, path, "--out", tmp_path / "no.ls")
-    assert code == 2 and "the tool that is active" in err and "the user frame that is active" in err
+    assert code == 2 and "the active tool" in err and "the active user frame" in err
 
 
-def test_a_configuration_that_is_not_the_poses_is_said_with_its_line(fitted, tmp_path, capsys):
+def test_foreign_configuration_is_said(fitted, tmp_path, capsys):
+    """A configuration that is not the pose's is said with its line."""
     folder, chain = fitted
     path = tmp_path / "p.ls"
     path.write_text(program(chain, configuration="N U B, 0, 0, 0"))
@@ -112,7 +115,7 @@ def test_a_configuration_that_is_not_the_poses_is_said_with_its_line(fitted, tmp
     assert code == 2 and "CONFIG N U B 0 0 0 (behind axis 1" in err and "before axis 1" in err
     path.write_text(program(chain, configuration="N U T, 3, 0, 0"))
     code, _, err = run(capsys, folder, path, "--out", tmp_path / "no.ls", *statements)
-    assert code == 2 and "none within the joints' limits has its turns" in err and "line 9: " in err
+    assert code == 2 and "none within the joints' limits has the stated turns" in err and "line 9: " in err
     near = ",".join(map(str, Q[0]))
     code, out, err = run(capsys, folder, path, "--out", tmp_path / "near.ls", "--start", near, *statements)
     assert code == 0 and "warning: line 9: CONFIG N U T 3 0 0 has no posture" in out, err

@@ -53,7 +53,8 @@ def test_a_program_reads_back_as_its_poses(tmp_path, name, output):
     assert np.abs(q - Q).max() <= 2.01 * rounding, "a coupled axis carries the rounding of two"
 
 
-def test_a_fanuc_counts_joint_3_from_the_horizontal(tmp_path):
+def test_fanuc_joint_3_is_from_horizontal(tmp_path):
+    """A Fanuc counts joint 3 from the horizontal."""
     text = written(tmp_path, "fanuc", np.radians([[10.0, 20.0, 30.0, 0.0, 0.0, 0.0]]))[".ls"].read_text()
     assert "J3=    10.000 deg" in text, "30 of the description, less the 20 of joint 2"
     count = int(text.partition("LINE_COUNT\t= ")[2].partition(";")[0])
@@ -71,7 +72,8 @@ def test_a_node_is_python_with_the_poses(tmp_path, name):
     assert ast.literal_eval(values["JOINTS"])[6] == "joint7"
 
 
-def test_val3_files_are_xml_whose_program_names_the_data(tmp_path):
+def test_val3_is_xml_and_names_its_data(tmp_path):
+    """VAL3 files are XML whose program names the data."""
     found = written(tmp_path, "staubli", output=2)
     trees = {suffix: ElementTree.parse(path).getroot() for suffix, path in found.items()}
     data = {node.get("name"): node for node in trees[".dtx"].iter() if node.tag.endswith("}Data")}
@@ -88,7 +90,8 @@ def test_joints_that_a_kuka_kept_are_read(tmp_path):
     assert joints_in(data)[0][0, 1] == pytest.approx(np.radians(-90.5))
 
 
-def test_what_a_controller_does_not_take_is_named(tmp_path):
+def test_what_controller_refuses_is_named(tmp_path):
+    """What a controller does not take is named."""
     path = listed(tmp_path / "p.csv", Q)
     seven = listed(tmp_path / "seven.csv", np.zeros((2, 7)))
     for words, given in {
@@ -98,20 +101,21 @@ def test_what_a_controller_does_not_take_is_named(tmp_path):
     }.items():
         with pytest.raises(UsageError, match=words):
             program_files(*given)
-    with pytest.raises(UsageError, match="raises no output"):
+    with pytest.raises(UsageError, match="the operator presses a key"):
         program_files(path, tmp_path / "cal", "ros2", ProgramSettings(output=1))
     (tmp_path / "empty.src").write_text("DEF empty()\n; PTP {A1 1,A2 2,A3 3,A4 4,A5 5,A6 6}\nPTP {A1 5}\nEND\n")
-    with pytest.raises(MeasurementError, match="has no targets"):
+    with pytest.raises(MeasurementError, match="has no complete targets"):
         read_program(tmp_path / "empty.src")
     (tmp_path / "rail.csv").write_text("rail [mm],joint1 [deg]\n1,2\n")
-    with pytest.raises(UsageError, match="rail slides"):
+    with pytest.raises(UsageError, match=r"not lengths: rail"):
         program_files(tmp_path / "rail.csv", tmp_path / "cal", "ros2")
     (tmp_path / "plain.csv").write_text("q1,q2\n1,2\n")
     with pytest.raises(UsageError, match="no column of joint angles"):
         program_files(tmp_path / "plain.csv", tmp_path / "cal", CSV)
 
 
-def test_other_bytes_stay_when_targets_are_rewritten(tmp_path):
+def test_other_bytes_stay_when_rewritten(tmp_path):
+    """Other bytes stay when targets are rewritten."""
     text = (
         b"MODULE m\r\n  ! \xe4lter [[1,2,3,4,5,6],[9E9,9E9,9E9,9E9,9E9,9E9]]\r\n"
         b"  CONST jointtarget a:=[[1,-2.50,3,4,5,6],[9E9,9E9,9E9,9E9,9E9,9E9]];\r\n"
@@ -129,7 +133,7 @@ def test_other_bytes_stay_when_targets_are_rewritten(tmp_path):
     np.testing.assert_allclose(turned[:3], [[-1, 0, 0, 0.5005], [0, 1, 0, 0], [0, 0, -1, 0.4]], atol=1e-15)
 
 
-def test_moves_without_a_target_are_named_with_their_lines(tmp_path, capsys):
+def test_moves_without_target_are_named(tmp_path, capsys):
     """A program that was edited by hand is brought back: a typing error leaves no pose out unnoticed."""
     path = written(tmp_path, "krl", np.radians([[10.0, 20.0, 30.0, 0.0, 0.0, 0.0], [0.0] * 6]))[".src"]
     text = path.read_text()
@@ -154,7 +158,8 @@ def test_a_yaskawa_gets_pulses(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "cycle"), [("ur", 0.008), ("krl", 0.004), ("rapid", 0.004)])
-def test_a_motion_becomes_setpoints_at_the_controllers_cycle(tmp_path, name, cycle):
+def test_motion_becomes_cycle_setpoints(tmp_path, name, cycle):
+    """A motion becomes setpoints at the controller's cycle."""
     t = np.arange(201) / 100.0
 
     def q(t: np.ndarray) -> np.ndarray:
@@ -175,7 +180,8 @@ def test_a_motion_becomes_setpoints_at_the_controllers_cycle(tmp_path, name, cyc
 
 
 @pytest.mark.slow
-def test_a_session_writes_the_program_beside_the_poses(tmp_path):
+def test_session_writes_program_beside_poses(tmp_path):
+    """A session writes the program beside the poses."""
     session = begin(tmp_path / "cell", "tx40", "tracker", poses=12, validation=4)
     edit(tmp_path / "cell/session.toml", 'controller = ""', 'controller = "krl"')
     geometry_steps.select(open_session(session.folder), lambda words: None)
@@ -185,7 +191,8 @@ def test_a_session_writes_the_program_beside_the_poses(tmp_path):
     assert (tmp_path / "cell/2-poses/validation_poses.dat").is_file()
 
 
-def test_a_log_of_a_fanuc_is_read_as_the_descriptions_joints(tmp_path):
+def test_fanuc_log_has_description_joints(tmp_path):
+    """A log of a Fanuc is read as the description's joints."""
     t = np.arange(400) / 100.0
     q = 0.5 * np.sin(t[:, None] * np.arange(1, 7))
     shown = controller_named("fanuc").shown(q)
@@ -198,7 +205,7 @@ def test_a_log_of_a_fanuc_is_read_as_the_descriptions_joints(tmp_path):
 
 
 @pytest.mark.parametrize("joint", ["q", "J"])
-def test_measured_poses_of_a_fanuc_are_read_as_the_descriptions_joints(tmp_path, joint):
+def test_fanuc_poses_have_description_joints(tmp_path, joint):
     """From our columns, and from RoboDK's."""
     shown = controller_named("fanuc").shown(Q)
     unit = " [deg]" if joint == "q" else ""
@@ -212,7 +219,8 @@ def test_measured_poses_of_a_fanuc_are_read_as_the_descriptions_joints(tmp_path,
         read_measurements(tmp_path / "m.csv", names, FileOptions(controller="fanuk"))
 
 
-def test_joints_that_a_fanuc_kept_have_their_poses_numbers_and_are_those_of_the_description(tmp_path):
+def test_joints_kept_by_fanuc_are_mapped(tmp_path):
+    """Joints that a Fanuc kept have their pose's numbers and are those of the description."""
     # As backups hold POSREG.VA: register 2 was not read, 3 is a pose of the tool.
     (tmp_path / "POSREG.VA").write_text(
         "[*POSREG*]$POSREG  Storage: CMOS  Access: RW  : ARRAY[1,4] OF Position Reg\n"
@@ -227,7 +235,8 @@ def test_joints_that_a_fanuc_kept_have_their_poses_numbers_and_are_those_of_the_
     assert table.cells[3] == pytest.approx([50.0, 5.0]), "J3 counts from the horizontal"
 
 
-def test_a_session_refuses_a_controller_that_does_not_take_its_arm(tmp_path):
+def test_session_refuses_unfit_controller(tmp_path):
+    """A session refuses a controller that does not take its arm."""
     for name, words in (("krl", "takes 6"), ("kr", "is not one of"), ("yaskawa", "takes 6")):
         with pytest.raises(UsageError, match=words):
             check_controller(name, 7)

@@ -51,18 +51,21 @@ def ran(folder: Path, text: str) -> blocks.Report:
     return blocks.run(page, folder / "run")
 
 
-def test_a_page_holds_where_it_shows_what_it_prints(tmp_path: Path) -> None:
+def test_page_holds_where_it_prints_as_shown(tmp_path: Path) -> None:
+    """A page holds where it shows what it prints."""
     report = ran(tmp_path, PAGE.format(shown="rms 0.121 mm of 40 poses"))  # within the tolerance
     assert report.complaints == [] and len(report.remarks) == 1 and "absent" in report.remarks[0]
 
 
 @pytest.mark.parametrize("shown", ["rms 0.15 mm of 40 poses", "rms 0.123 mm of 40 points", "rms 0.123 mm of 50 poses"])
-def test_another_number_or_word_is_a_complaint(tmp_path: Path, shown: str) -> None:
+def test_changed_number_or_word_is_complaint(tmp_path: Path, shown: str) -> None:
+    """Another number or word is a complaint."""
     (complaint,) = ran(tmp_path, PAGE.format(shown=shown)).complaints
     assert "page.md, line 3" in complaint and shown in complaint
 
 
-def test_fresh_numbers_are_recorded_and_a_looser_tolerance_is_stated(tmp_path: Path) -> None:
+def test_fresh_numbers_are_recorded(tmp_path: Path) -> None:
+    """Fresh numbers are recorded, and a looser tolerance is stated."""
     text = PAGE.format(shown="rms 0.15 mm of 40 poses")
     assert "rms 0.123 mm of 40 poses\n```" in ran(tmp_path, text).fresh
     (tmp_path / "loose").mkdir()
@@ -96,7 +99,8 @@ def test_what_the_concepts_name_exists() -> None:
 
 
 @pytest.mark.slow
-def test_the_reference_has_all_that_is_declared() -> None:
+def test_reference_has_all_declared_names() -> None:
+    """The reference has all that is declared."""
     import reference
 
     from calib.procedure import findings, formats
@@ -123,7 +127,8 @@ def test_notebooks_are_kept_without_outputs() -> None:
         assert all(not cell.get("outputs") and cell.get("execution_count") is None for cell in cells), path.name
 
 
-def test_the_command_finds_the_built_pages_or_says_how(tmp_path, monkeypatch, capsys) -> None:
+def test_command_finds_built_pages(tmp_path, monkeypatch, capsys) -> None:
+    """The command finds the built pages, or says how to build them."""
     monkeypatch.setattr(commands, "CLONE", tmp_path / "elsewhere")
     monkeypatch.chdir(tmp_path)
     assert cli.run(["docs"]) == 2 and "python docs/build.py" in capsys.readouterr().err

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import calib
-from calib.apps.fleet import prior
+from calib.apps.fleet import arm_distribution
 from calib.apps.fleet.tools import tools
 from calib.data.poses.fit_options import read_options
 from calib.data.poses.measurements import Positions
@@ -31,9 +31,9 @@ def arms(count: int, seed: int, uncertainty: float = 0.3) -> tuple[np.ndarray, l
     return true, [CalibratedChain(NOMINAL.with_values(one), NOMINAL, covariance) for one in found]
 
 
-def test_mean_and_deviation_of_many_arms_are_recovered() -> None:
+def test_mean_and_deviation_are_recovered() -> None:
     """Without what the fits themselves are uncertain by; the nominal, far off, counts as one of 101."""
-    found = prior.spread(arms(100, 1, uncertainty=1.0)[1])
+    found = arm_distribution.spread(arms(100, 1, uncertainty=1.0)[1])
     assert [one.name for one in found] == list(NOMINAL.names) and {one.arms for one in found} == {100}
     mean, sigma = np.array([[one.mean, one.sigma] for one in found]).T
     assert np.abs((mean - MEAN) / BETWEEN).max() < 0.4
@@ -41,32 +41,33 @@ def test_mean_and_deviation_of_many_arms_are_recovered() -> None:
 
 
 @pytest.mark.parametrize("count", [2, 4, 8])
-def test_the_next_arm_is_where_it_is_expected(count: int) -> None:
+def test_next_arm_is_where_expected(count: int) -> None:
     """χ² per parameter over 20 fleets: near 1, whatever the number of arms."""
     total = []
     for seed in range(20):
         true, robots = arms(count + 1, seed)
-        found = prior.spread(robots[:-1])
+        found = arm_distribution.spread(robots[:-1])
         mean, width = np.array([[one.mean, one.width] for one in found]).T
         total.append(np.mean(((true[-1] - NOMINAL.values - mean) / width) ** 2))
     assert 0.7 < np.mean(total) < 1.4, np.mean(total)
 
 
-def test_a_parameter_that_few_arms_fitted_takes_its_familys_deviation() -> None:
+def test_rare_parameter_has_family_deviation() -> None:
+    """A parameter that few arms fitted takes its family's deviation."""
     _, robots = arms(6, 3)
     assert robots[0].covariance is not None
     fewer = robots[0].covariance.copy()
     fewer[0], fewer[:, 0] = 0.0, 0.0
-    found = prior.spread([robots[0], *(replace(one, covariance=fewer) for one in robots[1:])])
+    found = arm_distribution.spread([robots[0], *(replace(one, covariance=fewer) for one in robots[1:])])
     assert (found[0].arms, found[1].arms) == (1, 6)
     with pytest.raises(UsageError, match="no fit of these arms states the covariance"):
-        prior.spread([replace(one, covariance=None) for one in robots])
+        arm_distribution.spread([replace(one, covariance=None) for one in robots])
 
 
 def test_ten_poses_are_enough_with_a_prior(tmp_path) -> None:
     """Without, they are refused. The prior is read from its folder, as the command does."""
     true, robots = arms(9, 5)
-    prior.write(tmp_path, robots[:-1], prior.spread(robots[:-1]))
+    arm_distribution.write(tmp_path, robots[:-1], arm_distribution.spread(robots[:-1]))
     arm = NOMINAL.with_values(true[-1])
 
     def measured(count: int, seed: int) -> Positions:
@@ -79,7 +80,7 @@ def test_ten_poses_are_enough_with_a_prior(tmp_path) -> None:
     with pytest.raises(CalibError, match="10 poses are too few"):
         calib.fit_geometry("ur5", few, settings, validate=unseen)
     found = calib.fit_geometry(
-        tmp_path, few, settings, validate=unseen, options=read_options(tmp_path / prior.OPTIONS)
+        tmp_path, few, settings, validate=unseen, options=read_options(tmp_path / arm_distribution.OPTIONS)
     ).validation["a.csv"]
     expected, calibrated = (1e3 * one.position.mean() for one in found.errors)
     assert calibrated < 0.2 * expected, (calibrated, expected)
@@ -99,7 +100,7 @@ def test_a_bent_and_a_loose_tool_are_named() -> None:
     assert not [one for one in tools({name: row for name, row in used.items() if row[0] == "T2"}) if one.findings()]
 
 
-def test_few_arms_that_happen_to_agree_accuse_no_tool() -> None:
+def test_few_agreeing_arms_accuse_no_tool() -> None:
     """Of three arms with each of two equal tools, 2.6 σ are exceeded as seldom as said, in distance and in error.
 
     The tool's position scatters along one axis, as it does where that is also the last link's.
@@ -115,7 +116,7 @@ def test_few_arms_that_happen_to_agree_accuse_no_tool() -> None:
     assert (beyond < 0.02).all(), beyond
 
 
-def test_three_arms_show_a_tool_that_is_far_off() -> None:
+def test_three_arms_show_a_tool_far_off() -> None:
     """Heights [mm] of six simulated arms' tools, one 4 mm longer; with the names exchanged, none is accused."""
     heights = {"A": (99.426, 100.962, 100.204), "B": (104.099, 104.56, 103.478)}
     used = {f"{tool}{z}": (tool, np.array([0.05, 0.02, 1e-3 * z]), 5e-5) for tool, own in heights.items() for z in own}

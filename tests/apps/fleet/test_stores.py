@@ -29,7 +29,8 @@ def place(tmp_path: Path) -> str:
     return f"file://{tmp_path / 'cell'}"
 
 
-def test_what_changed_is_put_back_and_nothing_else(place: str, tmp_path: Path) -> None:
+def test_only_changes_are_put_back(place: str, tmp_path: Path) -> None:
+    """What changed is put back, and nothing else."""
     before = (tmp_path / "cell/session.toml").stat().st_mtime_ns
     with stores.held(place) as folder:
         assert (folder / "session.toml").read_text() == "robot"
@@ -52,13 +53,13 @@ def test_object_storage_without_folders() -> None:
         (folder / "5-validation").mkdir()
         (folder / "5-validation/metrics.json").write_text("{}")
     assert sorted(files.find("/bucket/a")) == ["/bucket/a/5-validation/metrics.json", "/bucket/a/session.toml"]
-    with pytest.raises(UsageError, match="no session is there"):
+    with pytest.raises(UsageError, match="no session"):
         stores.sessions("memory://bucket/nothing")
     with pytest.raises(UsageError, match="smoke"):
         stores.sessions("smoke://bucket/*")
 
 
-def test_a_full_disk_in_the_middle_leaves_the_state_of_before(place: str, tmp_path: Path, monkeypatch) -> None:
+def test_full_disk_leaves_earlier_state(place: str, tmp_path: Path, monkeypatch) -> None:
     """What says that a step is complete is written after what the step made, or not at all."""
     from fsspec.implementations.local import LocalFileSystem
 
@@ -104,9 +105,10 @@ def test_two_clients_on_one_session(place: str, tmp_path: Path, monkeypatch: pyt
 
 
 @pytest.mark.parametrize(("text", "busy"), [("", True), (None, False)], ids=["being written", "released"])
-def test_a_claim_without_text_is_being_renewed(
+def test_claim_without_text_is_being_renewed(
     place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str | None, busy: bool
 ) -> None:
+    """A claim without text is being renewed."""
     claim = tmp_path / "cell/calib.claim"
     claim.write_text("process 1 on elsewhere (0) 7")
 
@@ -121,7 +123,8 @@ def test_a_claim_without_text_is_being_renewed(
         pass
 
 
-def test_who_was_slow_writes_nothing_once_another_took_over(place: str, tmp_path: Path) -> None:
+def test_slow_worker_writes_nothing_late(place: str, tmp_path: Path) -> None:
+    """Who was slow writes nothing once another took over."""
     late = stores.held(place, 1000.0)  # its claim does not change for long: as if it were gone
     folder = late.__enter__()
     with stores.held(place, QUICK) as mine:
@@ -152,7 +155,7 @@ with workers(sys.argv[1]) as crew:
 
 
 @pytest.mark.slow
-def test_scheduler_worker_and_client_killed_in_the_middle(tmp_path: Path) -> None:
+def test_scheduler_worker_or_client_killed(tmp_path: Path) -> None:
     """Each in turn, on 16 cells of four steps: nothing is lost, and no step counts twice."""
     places = [f"file://{tmp_path}/cells/{k:02d}" for k in range(16)]
     for one in ("first", "second"):

@@ -42,7 +42,8 @@ def given(monkeypatch: pytest.MonkeyPatch):
     return found
 
 
-def test_the_latest_date_is_current_in_whatever_order_they_are_given(given) -> None:
+def test_latest_date_is_current(given) -> None:
+    """The latest date is current, in whatever order they are given."""
     by_arm, noticed = given({name: ("R7", DATES[name], "2026-11-27T10:00:00+00:00", "pass") for name in "abc"})
     assert by_arm == {"R7": ["c", "b", "a"]}
     told = noticed["current-calibration"].values
@@ -52,7 +53,8 @@ def test_the_latest_date_is_current_in_whatever_order_they_are_given(given) -> N
 
 
 @pytest.mark.parametrize("dates", [("2026-06-15", ""), ("15.6.2026", "2026-01-15"), ("2026-01-15", "2026-01-15")])
-def test_dates_that_tell_no_order_leave_it_as_given(given, dates: tuple[str, str]) -> None:
+def test_unordered_dates_keep_given_order(given, dates: tuple[str, str]) -> None:
+    """Dates that tell no order leave it as given."""
     by_arm, noticed = given(
         {name: ("R7", date, "2026-11-27T10:00:00+00:00", "pass") for name, date in zip("ab", dates)}
     )
@@ -60,12 +62,12 @@ def test_dates_that_tell_no_order_leave_it_as_given(given, dates: tuple[str, str
     assert by_arm == {"R7": ["a", "b"]} and told["how"] == "the order given" and told["needed"] == "measured_on"
 
 
-def test_unfinished_sessions_are_left_out_and_named(given) -> None:
+def test_unfinished_sessions_are_left_out(given) -> None:
     """Also one whose fit is there and not judged; refused where fewer than two are left."""
     rows = {"a": ("", "", "", "pass"), "b": ("", "", "", "fail"), "c": ("", "", "", None), "d": ("", "", "", "")}
     by_arm, noticed = given(rows)
     assert list(by_arm) == ["a", "b"] and noticed["sessions-unfinished"].values["sessions"] == ("c", "d")
     assert noticed["arms-without-serial"].values["arms"] == ("a", "b")
     del rows["b"]
-    with pytest.raises(UsageError, match="c, d; 1 of 3 left"):
+    with pytest.raises(UsageError, match="c, d; 1 of 3 have one"):
         given(rows)

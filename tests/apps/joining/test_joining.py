@@ -52,7 +52,8 @@ def joints(tmp_path: Path, q: np.ndarray) -> Path:
     return write(tmp_path / "joints.csv", ["pose", *JOINTS], ([f"P{k + 1}", *row] for k, row in enumerate(q)))
 
 
-def test_points_are_joined_by_name_and_missing_ones_named(tmp_path, joints, arm, q):
+def test_points_are_joined_by_name(tmp_path, joints, arm, q):
+    """Points are joined by name, and missing ones are named."""
     points = seen(arm, q)
     named = write(tmp_path / "p.csv", ["Point Name", *POINT], ([f"p_{k + 1:03d}", *points[k]] for k in SHUFFLED))
     out = tmp_path / "measured.csv"
@@ -67,7 +68,8 @@ def test_points_are_joined_by_name_and_missing_ones_named(tmp_path, joints, arm,
     np.testing.assert_allclose(1e3 * block.position, points[found.poses], rtol=1e-9)
 
 
-def test_37_of_40_points_in_another_order_are_found_by_the_geometry(tmp_path, joints, arm, q):
+def test_shuffled_points_found_by_geometry(tmp_path, joints, arm, q):
+    """37 of 40 points in another order are found by the geometry."""
     points = write(tmp_path / "p.csv", POINT, seen(arm, q)[SHUFFLED])
     with pytest.raises(UsageError, match=r"40 rows of joints, 37 points cannot be joined.*give --robot"):
         calib.join(joints, points)
@@ -77,30 +79,33 @@ def test_37_of_40_points_in_another_order_are_found_by_the_geometry(tmp_path, jo
     )
 
 
-def test_a_wrong_order_of_rows_is_noticed_and_points_of_another_arm_are_refused(tmp_path, joints, arm, q):
+def test_wrong_order_or_arm_is_noticed(tmp_path, joints, arm, q):
+    """A wrong order of rows is noticed, and points of another arm are refused."""
     points = seen(arm, q)
     points[[3, 7]] = points[[7, 3]]
     found = calib.join(joints, write(tmp_path / "p.csv", POINT, points), by="row", robot="lwr4plus")
     np.testing.assert_allclose(found.table.numbers("x", "length")[3], 1e-3 * points[7, 0])
     other = write(tmp_path / "o.csv", POINT, seen(arm, random_joints(arm, 40, 9)))
-    with pytest.raises(MeasurementError, match="not those of these 40 poses in any order"):
+    with pytest.raises(MeasurementError, match="do not fit the 40 poses in any order"):
         calib.join(joints, other, robot="lwr4plus")
     with pytest.raises(UsageError, match="by 'rows' is not one of name, time, row, geometry"):
         calib.join(joints, other, by="rows")
 
 
-def test_readings_5_mm_apart_are_named_and_near_ones_averaged_with_their_scatter(tmp_path, joints, arm, q):
+def test_near_readings_are_averaged(tmp_path, joints, arm, q):
+    """Readings 5 mm apart are named, and near ones are averaged with their scatter."""
     points, rng = seen(arm, q), np.random.default_rng(2)
     rows = [[f"P{k + 1}", *(points[k] + 0.02 * rng.normal(size=3))] for k in range(40) for _ in range(2)]
     rows[8][1] += 5.0
     found = calib.join(joints, write(tmp_path / "p.csv", ["Name", *POINT], rows))
     assert 4 not in found.poses and len(found.poses) == 39
-    assert any("between readings of pose P5 (rows 9, 10), which is left out" in note for note in found.notes)
+    assert any("pose P5 left out: its readings (rows 9, 10) differ by" in note for note in found.notes)
     sigma = found.table.numbers("sigma_x", "length")
     assert sigma == pytest.approx(0.02e-3 / np.sqrt(2.0), rel=0.3)
 
 
-def test_points_join_a_log_by_time_where_the_arm_stands(tmp_path, arm, q):
+def test_points_join_log_where_arm_stands(tmp_path, arm, q):
+    """Points join a log by time where the arm stands."""
     times = np.arange(0.0, 80.0, 0.1)
     at = np.interp(times, np.repeat(2.0 * np.arange(40), 2) + np.tile([0.0, 1.5], 40), np.arange(80) // 2)
     values = (
@@ -125,7 +130,8 @@ def planned(tmp_path: Path, q: np.ndarray) -> Session:
     return session
 
 
-def test_a_session_takes_points_alone_with_the_planned_joints(planned, arm, q):
+def test_session_takes_points_alone(planned, arm, q):
+    """A session takes points alone with the planned joints."""
     path = write(planned.path("3-measured/points.csv"), POINT, seen(arm, q)[SHUFFLED])
     notes = [str(note) for note in arrive(planned, print)]
     assert any("those of the planned poses are used, σ 0.1" in note for note in notes)
@@ -135,7 +141,8 @@ def test_a_session_takes_points_alone_with_the_planned_joints(planned, arm, q):
     np.testing.assert_allclose(block.q, q[sorted(SHUFFLED)], atol=1e-12)
 
 
-def test_an_interrupted_run_goes_on_in_a_second_file(planned, arm, q):
+def test_interrupted_run_has_a_second_file(planned, arm, q):
+    """An interrupted run goes on in a second file."""
     points = seen(arm, q)
     write(planned.path("3-measured/a.csv"), POINT, points[:25])
     assert any("15 of 40 planned poses remain" in note.text for note in arrive(planned, print))

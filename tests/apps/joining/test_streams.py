@@ -107,7 +107,8 @@ def changed(source: Path, path: Path, change: Callable[[np.ndarray], np.ndarray]
     return path
 
 
-def test_the_clock_is_found_and_neighbours_that_are_kept_are_nearly_independent(found):
+def test_clock_found_and_rows_independent(found):
+    """The clock is found, and neighbours that are kept are nearly independent."""
     clock, step = found.clock, 0.01
     assert abs(clock.offset - OFFSET) < 3.0 * clock.sigma < 0.5e-3
     assert abs(clock.drift) < 3.0 * clock.drift_sigma < 2e-5
@@ -119,7 +120,8 @@ def test_the_clock_is_found_and_neighbours_that_are_kept_are_nearly_independent(
     assert len(found.table) == pytest.approx(105.0 / (1.5 * found.correlation), rel=0.15)
 
 
-def test_the_command_writes_a_table_for_fit_with_the_reasons_above_it(tmp_path, files, found, capsys, monkeypatch):
+def test_command_writes_table_with_reasons(tmp_path, files, found, capsys, monkeypatch):
+    """The command writes a table for `fit`, with the reasons above it."""
     asked = list[object]()
     monkeypatch.setattr(joining, "join_streams", lambda *given: asked.extend(given) or found)
     out = tmp_path / "poses.csv"
@@ -139,14 +141,16 @@ def test_the_command_writes_a_table_for_fit_with_the_reasons_above_it(tmp_path, 
         np.testing.assert_allclose(own, np.radians(np.interp(times, log[:, 0], column)), atol=1e-5)
 
 
-def test_one_percent_of_damaged_rows_is_dropped_and_counted(found):
+def test_damaged_rows_are_counted(found):
+    """One per cent of damaged rows is dropped and counted."""
     jumps = len(BAD) // 7
     words = f"left out: {len(BAD) - jumps} damaged, empty or not seen, {jumps} far from the arm's path"
     assert found.notes[1].endswith(words)
     assert not set(found.poses) & set(BAD)
 
 
-def test_residuals_of_rows_measured_in_motion_do_not_feel_offset_and_drift_of_the_clock(tmp_path, found):
+def test_residuals_ignore_offset_and_drift(tmp_path, found):
+    """Residuals of rows measured in motion do not feel offset and drift of the clock."""
     (block,) = calib.read_poses(found.write(tmp_path / "poses.csv"), "ur5")
     assert isinstance(block, Positions) and block.late is not None
     speed = np.gradient(block.position, found.table.cells[0], axis=0)
@@ -162,7 +166,8 @@ def test_residuals_of_rows_measured_in_motion_do_not_feel_offset_and_drift_of_th
 
 
 @pytest.mark.slow
-def test_backlash_and_gear_errors_do_not_pass_for_a_late_clock(tmp_path):
+def test_backlash_is_no_late_clock(tmp_path):
+    """Backlash and gear errors do not pass for a late clock."""
     errors = list[float]()
     for seed in range(4):
         clock = joined(*recorded(tmp_path, virtual_cell("ur5", seed), seed)).clock
@@ -172,7 +177,8 @@ def test_backlash_and_gear_errors_do_not_pass_for_a_late_clock(tmp_path):
 
 
 @pytest.mark.slow
-def test_drift_gaps_and_rows_that_go_back_in_time_are_said(tmp_path):
+def test_drift_gaps_and_going_back_are_said(tmp_path):
+    """Drift, gaps, and rows that go back in time are said."""
     cell = rigid(perturbed_cell(load("ur5"), 2))
     log, stream = recorded(tmp_path, cell, 2, drift=50e-6)
 
@@ -181,12 +187,13 @@ def test_drift_gaps_and_rows_that_go_back_in_time_are_said(tmp_path):
 
     again = joined(log, changed(stream, tmp_path / "t.csv", change))
     assert again.clock.drift == pytest.approx(50e-6, abs=3.0 * again.clock.drift_sigma)
-    assert "50 with a time not after the row before" in again.notes[1]
+    assert "50 with a time not after that of the row before" in again.notes[1]
     assert "1 gap not bridged, the longest 4.01 s" in again.notes[2]
 
 
 @pytest.mark.slow
-def test_rows_too_fast_for_uncertain_times_are_left_out(tmp_path, files, found):
+def test_rows_too_fast_are_left_out(tmp_path, files, found):
+    """Rows too fast for uncertain times are left out."""
     noise = np.random.default_rng(1).uniform(-3e-3, 3e-3, 20_000)
     log = changed(files[0], tmp_path / "log.csv", lambda rows: np.column_stack([rows[:, 0] + noise[: len(rows)],
                                                                                rows[:, 1:]]))  # fmt: skip
@@ -201,7 +208,8 @@ def test_rows_too_fast_for_uncertain_times_are_left_out(tmp_path, files, found):
 
 
 @pytest.mark.slow
-def test_an_arm_that_stands_still_for_a_while_gives_no_rows_there(tmp_path):
+def test_standing_arm_gives_no_rows(tmp_path):
+    """An arm that stands still for a while gives no rows there."""
     cell = rigid(perturbed_cell(load("ur5"), 3))
     log, stream = recorded(tmp_path, cell, 3, 140.0, pace=lambda t: np.interp(t, [0, 50, 80, 200], [0, 50, 50, 170]))
     again = joined(log, stream)
@@ -226,7 +234,8 @@ def test_sliding_joints_and_full_poses(tmp_path):
 
 
 @pytest.mark.slow
-def test_of_a_motion_that_repeats_itself_the_offset_is_said_to_be_ambiguous(tmp_path):
+def test_offset_of_repetition_is_ambiguous(tmp_path):
+    """The offset of a motion that repeats itself is said to be ambiguous."""
     cell = rigid(perturbed_cell(load("ur5"), 3))
     again = joined(*recorded(tmp_path, cell, 3, 160.0, pace=lambda t: 25.0 * np.sin(2.0 * np.pi * t / 40.0)))
     assert any("the motion repeats itself" in note for note in again.notes)
@@ -252,19 +261,22 @@ def check_step(log: Path, stream: Path, robot: str, size: float, file: str, row:
 
 
 @pytest.mark.parametrize("size", [5e-3, -0.02, 0.2])
-def test_a_step_of_the_instruments_clock_is_refused_with_its_size_and_row(tmp_path, files, size):
+def test_instrument_clock_step_is_refused(tmp_path, files, size):
+    """A step of the instrument's clock is refused with its size and row."""
     stream, row = stepped(files[1], tmp_path / "s.csv", 0.4, size)
     check_step(files[0], stream, "ur5", size, "s.csv", row)
 
 
-def test_a_step_of_the_logs_clock_is_found_in_the_log(tmp_path, files):
+def test_log_clock_step_is_found_in_the_log(tmp_path, files):
+    """A step of the log's clock is found in the log."""
     log, row = stepped(files[0], tmp_path / "l.csv", 0.6, 0.05)
     check_step(log, files[1], "ur5", -0.05, "l.csv", row)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("robot", ["ur5", "tx40"])
-def test_steps_are_found_in_arms_with_backlash_and_none_where_there_are_none(tmp_path, robot):
+def test_steps_are_told_from_backlash(tmp_path, robot):
+    """Steps are found in arms with backlash, and none where there are none."""
     for seed in range(4):
         log, stream = recorded(tmp_path, virtual_cell(robot, seed), seed, 160.0, drift=40e-6)
         assert abs(joined(log, stream, robot).clock.drift - 40e-6) < 2e-5
@@ -275,7 +287,8 @@ def test_steps_are_found_in_arms_with_backlash_and_none_where_there_are_none(tmp
 
 @pytest.mark.slow
 @pytest.mark.parametrize("period", [240.0, 60.0])
-def test_a_clock_that_wanders_by_a_millisecond_is_no_step(tmp_path, period):
+def test_wandering_clock_is_no_step(tmp_path, period):
+    """A clock that wanders by a millisecond is no step."""
     for seed in range(3):
         log, stream = recorded(tmp_path, rigid(perturbed_cell(load("ur5"), seed)), seed, 240.0)
         wander = changed(stream, tmp_path / "w.csv", lambda rows: rows + np.outer(
@@ -283,7 +296,7 @@ def test_a_clock_that_wanders_by_a_millisecond_is_no_step(tmp_path, period):
         one = joined(log, wander)
         assert one.clock.offset == pytest.approx(OFFSET, abs=1e-3)
         if period == 240.0:
-            assert any("ms: by so much the clocks' offset leaves the line" in note for note in one.notes)
+            assert any("ms from a line of offset and drift" in note for note in one.notes)
     far = changed(wander, tmp_path / "f.csv", lambda rows: rows + np.outer(
         0.015 * np.sin(2.0 * np.pi / 240.0 * rows[:, 0]), [1, 0, 0, 0]))  # fmt: skip
     with pytest.raises(MeasurementError, match=r"shorter parts|clock steps by"):
@@ -291,7 +304,8 @@ def test_a_clock_that_wanders_by_a_millisecond_is_no_step(tmp_path, period):
 
 
 @pytest.mark.slow
-def test_a_step_there_and_back_is_no_drift_either(tmp_path):
+def test_step_there_and_back_is_no_drift(tmp_path):
+    """A step there and back is no drift, either."""
     log, stream = recorded(tmp_path, rigid(perturbed_cell(load("ur5"), 1)), 1, 240.0)
     there, first = stepped(stream, tmp_path / "a.csv", 0.33, 0.03)
     back, last = stepped(there, tmp_path / "b.csv", 0.67, -0.03)
@@ -318,7 +332,7 @@ def test_what_thins_rows_is_said():
 def test_the_offset_is_said_with_its_time(found):
     line = next(note for note in found.notes if "minus the controller's" in note)
     first = found.clock.offset + found.clock.drift * (2.0 + OFFSET - found.clock.middle)
-    assert f" at {found.clock.middle:.2f} s of its own, {first:+.5f} s at its first row: " in line
+    assert f" at {found.clock.middle:.2f} s of the instrument's time, {first:+.5f} s at its first row; " in line
 
 
 REFUSED = {
@@ -326,14 +340,14 @@ REFUSED = {
     "stops": (lambda rows: rows[::500], "", "rows are 5 s apart, a stream's 0.2 s at most. Is t in ms"),
     "milliseconds": (lambda rows: rows * [1e3, 1, 1, 1], "", "rows are 10 s apart.*Is t in ms"),
     "mm as m": (lambda rows: rows, "t,x,y,z", r"if it is in mm, name the column 'x \[mm\]'"),
-    "m as mm": (lambda rows: rows * [1, 1e-3, 1e-3, 1e-3], "", "hardly moves.*is the unit right"),
+    "m as mm": (lambda rows: rows * [1, 1e-3, 1e-3, 1e-3], "", "moves by only.*is the unit right"),
     "inches": (lambda rows: rows / [1, 25.4, 25.4, 25.4], "", "inches"),
     "still": (lambda rows: np.column_stack([rows[:, 0], rows[0, 1:] + 1e-2 * np.sin(1e3 * rows[:, 1:])]), "",
-              "hardly moves"),
+              "moves by only"),
     "backwards": (lambda rows: np.column_stack([rows[::-1, 0], rows[:, 1:]]), "",
-                  "only 1 of .* rows can be used .*a time not after the row before"),
+                  "only 1 of .* rows can be used .*a time not after that of the row before"),
     "a jump of the clock": (lambda rows: rows + (rows[:, :1] > 60.0) * [7.0, 0, 0, 0], "",
-                            "at no offset of the clocks.*did no clock jump|did a clock jump"),
+                            "no offset of the clocks.*did no clock jump|did a clock jump"),
     "a clock that restarts": (lambda rows: rows - (rows[:, :1] > 60.0) * [58.0, 0, 0, 0], "",
                               r"row 5.*go back from (59\.9|60\.0)\d* to 2\.\d* s and run on .*restarted. Split"),
     "too short": (lambda rows: rows[:400], "", "offset of its clock is known to .* ms only|independent"),
@@ -342,18 +356,20 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_what_cannot_be_joined_is_refused_with_the_cause(tmp_path, files, case):
+def test_unjoinable_is_refused_with_cause(tmp_path, files, case):
+    """What cannot be joined is refused with the cause."""
     change, header, says = REFUSED[case]
     with pytest.raises(MeasurementError, match=says):
         joined(files[0], changed(files[1], tmp_path / "t.csv", change, header))
 
 
-def test_a_stream_of_another_motion_or_a_log_at_rest_is_refused(tmp_path, files):
+def test_stream_of_other_motion_is_refused(tmp_path, files):
+    """A stream of another motion, or a log at rest, is refused."""
     other, _ = recorded(tmp_path, rigid(perturbed_cell(load("ur5"), 3)), 5)
-    with pytest.raises(MeasurementError, match=r"at no offset of the clocks .*is it the log of this motion"):
+    with pytest.raises(MeasurementError, match=r"no offset of the clocks .*is it the log of this motion"):
         joined(other, files[1])
     still = changed(files[0], tmp_path / "still.csv", lambda rows: rows * ([1.0] + [0.0] * 6))
-    with pytest.raises(MeasurementError, match=r"hardly moves .*without motion no clock is found"):
+    with pytest.raises(MeasurementError, match=r"moves by only .*too little to identify the clocks' offset"):
         joined(still, files[1])
     radians = changed(files[0], tmp_path / "rad.csv", lambda rows: rows, "t,q1,q2,q3,q4,q5,q6")
     with pytest.raises(MeasurementError, match=r"name the column 'q\d \[deg\]'"):
@@ -362,7 +378,9 @@ def test_a_stream_of_another_motion_or_a_log_at_rest_is_refused(tmp_path, files)
         calib.join(*files, by="motion")
 
 
-def test_a_full_disk_leaves_nothing_half_written(tmp_path, found, monkeypatch):
+def test_full_disk_leaves_no_half_file(tmp_path, found, monkeypatch):
+    """A full disk leaves nothing half written."""
+
     def full(_: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -373,7 +391,8 @@ def test_a_full_disk_leaves_nothing_half_written(tmp_path, found, monkeypatch):
 
 
 @pytest.mark.slow
-def test_rows_held_are_bounded_however_long_the_stream(files, monkeypatch, found):
+def test_rows_held_are_bounded(files, monkeypatch, found):
+    """Rows held are bounded, however long the stream."""
     monkeypatch.setattr(stream_files, "HELD", 3000)
     monkeypatch.setattr(stream_files, "PIECE", 1000)
     again = joined(*files)
@@ -396,7 +415,8 @@ def errors_in_sigmas(chain: Chain, cell: Cell, q: np.ndarray, position: np.ndarr
 
 
 @pytest.mark.slow
-def test_offsets_and_parameters_err_as_their_sigmas_say_and_without_thinning_they_would_not(tmp_path):
+def test_errors_match_sigmas_when_thinned(tmp_path):
+    """Offsets and parameters err as their sigmas say, and without thinning they would not."""
     offsets, thinned, every = list[float](), list[np.ndarray](), list[np.ndarray]()
     for seed in range(3):
         cell = rigid(perturbed_cell(load("ur5"), seed))
@@ -418,6 +438,7 @@ def test_offsets_and_parameters_err_as_their_sigmas_say_and_without_thinning_the
 
 
 @pytest.mark.slow
-def test_a_cell_with_deflections_that_no_rigid_arm_has_keeps_its_clock(tmp_path):
+def test_deflecting_cell_keeps_its_clock(tmp_path):
+    """A cell with deflections that no rigid arm has keeps its clock."""
     again = joined(*recorded(tmp_path, perturbed_cell(load("ur5"), 6), 6))
     assert abs(again.clock.offset - OFFSET) < 4.0 * again.clock.sigma < 1e-3

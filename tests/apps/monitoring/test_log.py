@@ -45,17 +45,19 @@ def test_a_line_per_calibration_oldest_first(sessions):
 
 
 def test_robots_are_not_mixed_unless_told(sessions):
-    with pytest.raises(UsageError, match=r"different serial numbers \(A7, B1\); --mixed"):
+    with pytest.raises(UsageError, match=r"different serial numbers \(A7, B1\); give --mixed"):
         log([sessions / "old", sessions / "other"])
     assert [line.serial for line in log([sessions / "old", sessions / "other"], mixed=True).lines] == ["A7", "B1"]
 
 
-def test_a_session_without_a_verdict_is_refused(sessions):
+def test_session_without_verdict_is_refused(sessions):
+    """A session without a verdict is refused."""
     with pytest.raises(SessionError, match="has no verdict yet: calib next"):
         log([sessions / "begun"])
 
 
-def test_the_command_writes_page_table_and_figure(sessions, tmp_path, capsys):
+def test_command_writes_page_table_figure(sessions, tmp_path, capsys):
+    """The command writes page, table and figure."""
     pair = [str(sessions / name) for name in ("old", "new")]
     assert cli.run(["log", *pair, "--out", str(tmp_path / "out")]) == 0
     assert "Calibrations of".lower() in capsys.readouterr().out.lower()

@@ -26,7 +26,8 @@ def measured(seed: int, count: int = 12, noise: float = 1e-4) -> Poses:
     return Poses(q, ARM.joint_names, position, turns.as_quat())
 
 
-def test_frames_are_recovered_within_their_sigma():
+def test_frames_are_recovered_within_sigma():
+    """Frames are recovered within their sigma."""
     truths = {"tool": TOOL, "base": STATION, "instrument": invert(STATION)}
     scaled = {name: [] for name in truths}
     for seed in range(12):
@@ -40,7 +41,8 @@ def test_frames_are_recovered_within_their_sigma():
         assert 0.75 < np.sqrt(np.mean(np.square(found))) < 1.3, name
 
 
-def test_positions_alone_leave_the_orientation_of_the_tool_open():
+def test_positions_leave_orientation_open():
+    """Positions alone leave the orientation of the tool open."""
     full = measured(1)
     (tool, *_) = calib.base("ur5", PoseMeasurements.of(full.q, full.position, joint_names=full.joint_names)).placed
     assert np.isnan(tool.sigma[3:]).all() and str(tool).endswith("orientation not identifiable")
@@ -48,7 +50,8 @@ def test_positions_alone_leave_the_orientation_of_the_tool_open():
 
 
 @pytest.mark.parametrize(("limit", "level"), [(1.0, "pass"), (0.01, "fail")])
-def test_the_command_says_what_the_function_says(tmp_path, capsys, limit, level):
+def test_command_says_what_function_says(tmp_path, capsys, limit, level):
+    """The command says what the function says."""
     full, path = measured(2), tmp_path / "m.csv"
     header = ",".join([*(f"q{k}" for k in range(1, 7)), "x", "y", "z", "qx", "qy", "qz", "qw"])
     np.savetxt(path, np.hstack([full.q, full.position, full.quaternion]), delimiter=",", header=header, comments="")

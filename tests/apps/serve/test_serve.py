@@ -65,13 +65,14 @@ def test_the_page_says_what_calib_next_says(session: Session, client: TestClient
     assert len(lines) == 3 and all(line in shown for line in (*lines, file))
 
 
-def test_files_come_under_the_names_that_the_session_reads(session: Session, client: TestClient) -> None:
+def test_files_get_the_sessions_names(session: Session, client: TestClient) -> None:
+    """Files come under the names that the session reads."""
     assert bring(client, "measured", "../../Shots 1.csv").status_code == 303
     assert bring(client, "validation", "later.csv").status_code == 303
     names = {kind: [path.name for path in session.brought(kind)] for kind in ("measured", "validation")}
     assert names == {"measured": ["Shots 1.csv"], "validation": ["validation_later.csv"]}
     assert client.app.state.work.current.task == CHECK  # type: ignore[attr-defined]
-    for name, words in (("validation.csv", "says other files"), ("shots.xlsx", "expected .csv")):
+    for name, words in (("validation.csv", "have another upload"), ("shots.xlsx", "expected .csv")):
         refused = bring(client, "measured", name)
         assert refused.status_code == 400 and words in refused.text
     assert bring(client, "training", "log.csv").status_code == 404, "the session has no dynamics"

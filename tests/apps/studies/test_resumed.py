@@ -44,7 +44,7 @@ def timeless(rows: list[TrialRow]) -> list[str]:
     return sorted(str({k: v for k, v in asdict(row).items() if k not in ("seconds", "cpu")}) for row in rows)
 
 
-def test_rows_that_are_there_are_not_run_again(study: Path, tmp_path: Path):
+def test_existing_rows_are_not_run_again(study: Path, tmp_path: Path):
     """More runs are added; a file edited half-way keeps what its new conditions share with the old."""
     first = run_study([study], tmp_path / "out", runs=1, plots=False)
     second = run_study([study], tmp_path / "out", runs=2, plots=False)
@@ -58,7 +58,7 @@ def test_rows_that_are_there_are_not_run_again(study: Path, tmp_path: Path):
     assert run_study([study], tmp_path / "out", runs=2, plots=False).progress.done == 0
 
 
-def test_a_method_that_changed_is_run_again_and_no_other(study: Path, tmp_path: Path, monkeypatch):
+def test_only_changed_method_is_run_again(study: Path, tmp_path: Path, monkeypatch):
     """Its old rows do not count, in a report alone neither; a row of today states the change."""
     run_study([study], tmp_path / "out", runs=2, plots=False)
     before = {row.key: row for row in read_rows(tmp_path / "out")}
@@ -95,7 +95,8 @@ def test_a_study_that_runs_may_be_looked_at(study: Path, tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_a_cluster_that_loses_a_worker_loses_no_trial(study: Path, tmp_path: Path):
+def test_lost_worker_loses_no_trial(study: Path, tmp_path: Path):
+    """A cluster that loses a worker loses no trial."""
     with dask_cluster.running(tmp_path, workers=2) as cluster:
         killed = []
 

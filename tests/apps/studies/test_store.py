@@ -37,7 +37,8 @@ def test_a_key_counts_once(tmp_path: Path):
     assert len(read_rows(tmp_path)) == 5
 
 
-def test_rows_are_read_while_a_command_writes(tmp_path: Path):
+def test_rows_are_read_during_writes(tmp_path: Path):
+    """Rows are read while a command writes."""
     with opened(tmp_path) as store:
         store.append(rows(2))
         assert len(read_rows(tmp_path)) == 2
@@ -45,7 +46,7 @@ def test_rows_are_read_while_a_command_writes(tmp_path: Path):
         assert len(read_rows(tmp_path)) == 3
 
 
-def test_a_kill_in_the_middle_of_a_write_loses_no_row_of_before(tmp_path: Path):
+def test_kill_during_write_loses_no_row(tmp_path: Path):
     """The process dies with a transaction open: the next command finds the rows that were kept, and goes on."""
     script = f"""
 import os, sys
@@ -79,7 +80,8 @@ def test_two_commands_do_not_share_a_folder(tmp_path: Path):
         ("DROP TABLE rows; CREATE TABLE rows (digest)", "damaged: no such column"),
     ],
 )
-def test_a_store_of_another_version_or_damaged_is_refused_as_it_is(kept: Path, spoil: str, words: str):
+def test_other_or_damaged_store_is_refused(kept: Path, spoil: str, words: str):
+    """A store of another version, or a damaged one, is refused as it is."""
     with closing(sqlite3.connect(kept)) as base:
         base.executescript(spoil)
     before = kept.read_bytes()
@@ -95,7 +97,7 @@ def test_what_is_no_store_is_refused(kept: Path):
 
 
 @pytest.mark.slow
-def test_a_full_disk_loses_nothing_that_was_kept(tmp_path: Path):
+def test_full_disk_loses_nothing_kept(tmp_path: Path):
     """Under a limit of the file's size a row is refused whole, and the rows before it stand."""
     script = f"""
 import resource, sys
@@ -118,7 +120,8 @@ with opened(Path({str(tmp_path)!r})) as store:
     assert len(read_rows(tmp_path)) == 3
 
 
-def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path):
+def test_impossible_folder_is_refused(tmp_path: Path):
+    """A folder that cannot be made is refused."""
     (tmp_path / "file").write_text("")
     with pytest.raises(CalibError), opened(tmp_path / "file" / "inside"):
         pass

@@ -59,17 +59,20 @@ def test_the_surveys_conditions_are_there():
     assert fifth.sigma_q == pytest.approx(np.deg2rad(1e-2))
 
 
-def test_every_shipped_study_is_named_as_its_file():
+def test_shipped_studies_named_as_files():
+    """Every shipped study is named as its file."""
     assert all(read_study([name]).name == name for name in shipped())
 
 
-def test_combinations_are_named_by_what_varies(tmp_path: Path):
+def test_combinations_named_by_what_varies(tmp_path: Path):
+    """Combinations are named by what varies."""
     text = FILE.replace('"rv2sq"', '["tx40", "rv2sq"]').replace("runs = 3", 'runs = 3\nmismatch = ["none", "clock"]')
     names = [one.name for one in read_study([written(tmp_path, text)]).conditions]
     assert names == ["small-tx40-none", "small-tx40-clock", "small-rv2sq-none", "small-rv2sq-clock"]
 
 
-def test_what_a_condition_is_called_is_no_part_of_what_it_is():
+def test_name_is_no_part_of_condition():
+    """What a condition is called is no part of what it is."""
     assert SHORT.digest == replace(SHORT, name="other", resimulated=5).digest
     assert SHORT.digest != replace(SHORT, sigma_tau=0.06).digest
 
@@ -95,7 +98,8 @@ def test_a_file_that_is_no_study_is_told_why(tmp_path: Path, old: str, new: str,
         read_study([written(tmp_path, FILE.replace(old, new))])
 
 
-def test_a_study_that_does_not_ship_is_told_its_neighbour():
+def test_unknown_study_is_told_neighbour():
+    """A study that does not ship is told its neighbour."""
     with pytest.raises(UsageError, match="did you mean 'MCS-TX40-1-1'"):
         read_study(["MCS-TX40-11"])
 
@@ -106,8 +110,8 @@ def forget() -> None:
     data_set.cache_clear()
 
 
-def test_methods_that_take_start_values_run_from_each_guess(tmp_path: Path):
-    """The others once per data set: their estimate would be the same."""
+def test_start_values_run_from_each_guess(tmp_path: Path):
+    """Methods without start values run once per data set: their estimate would be the same."""
     study = read_study([written(tmp_path, FILE.replace('"iv"]', '"hopfield"]\nguesses = 3'))])
     with opened(tmp_path / "out") as store:
         tasks = list(_missing(study, store))
@@ -115,14 +119,15 @@ def test_methods_that_take_start_values_run_from_each_guess(tmp_path: Path):
     assert seeds == {"wls": [0, 3, 6], "hopfield": list(range(9))}
 
 
-def test_guesses_are_the_same_for_every_data_set():
+def test_guesses_are_same_for_every_data_set():
+    """Guesses are the same for every data set."""
     one, two, three = (make_experiment(replace(SHORT, guesses=2), seed).problem for seed in range(3))
     assert one.rows is two.rows and not np.array_equal(one.rows[0].target, three.rows[0].target)
     assert one.start is not None and np.array_equal(one.start, np.asarray(three.start))
     assert not np.array_equal(one.start, np.asarray(two.start))
 
 
-def test_of_several_guesses_the_first_is_compared(small):
+def test_first_of_several_guesses_compared(small):
     """A method that is worse from other guesses has a larger median, and the same p."""
     (study, row), p = small, []
     for guesses, others in ((1, ()), (3, (1, 2))):
@@ -136,7 +141,8 @@ def test_of_several_guesses_the_first_is_compared(small):
 
 
 @pytest.mark.parametrize("robot", ["tx40", "rv2sq"])
-def test_designed_motions_keep_the_limits_of_random_ones(robot: str):
+def test_designed_motions_keep_limits(robot: str):
+    """Designed motions keep the limits of random ones."""
     setup = set_up(replace(SHORT, robot=robot, duration=10.0, motion="designed"))
     (lower, upper), motion = setup.chain.sampling_limits(), setup.reference
     inside = 0.5 * (1.0 - REACH) * (upper - lower)
@@ -164,7 +170,7 @@ def test_a_trial_is_pure():
     assert first.torque_error < 2.0
 
 
-def test_a_loop_that_cannot_be_recorded_is_a_row(monkeypatch: pytest.MonkeyPatch):
+def test_unrecordable_loop_is_a_row(monkeypatch: pytest.MonkeyPatch):
     """An unstable controller is counted, and ends nothing."""
     from calib.apps.studies import experiment
 
@@ -188,7 +194,8 @@ def test_failures_count_against_a_method(small):
     assert one.methods[1].failures == {"diverged": 2}
 
 
-def test_of_methods_as_good_as_each_other_the_cheap_one_is_taken(small):
+def test_cheapest_of_equal_methods_is_taken(small):
+    """The cheap one of methods that are as good as each other is taken."""
     (study, row), rng = small, np.random.default_rng(0)
     found = []
     for seed in range(30):
@@ -202,7 +209,7 @@ def test_of_methods_as_good_as_each_other_the_cheap_one_is_taken(small):
     assert one.chosen is not None and one.chosen.method == "iv"  # always larger by a fifth: told apart
 
 
-def test_what_is_there_stays_in_sight_of_a_study_that_asks_for_less(tmp_path: Path):
+def test_rows_beyond_the_study_stay_in_sight(tmp_path: Path):
     """A method that was added alone, or taken out of the file, leaves the others' rows in the summary."""
     study = read_study([written(tmp_path)], ["tls"])
     row = replace(ROW, digest=study.conditions[0].digest)

@@ -72,7 +72,8 @@ def test_a_board_that_cannot_be_is_refused(text, words, tmp_path):
         read_board(tmp_path)
 
 
-def test_a_board_larger_than_its_paper_is_refused_with_what_fits():
+def test_board_larger_than_paper_is_refused():
+    """A board larger than its paper is refused with what fits."""
     with pytest.raises(UsageError, match=r"larger than A4; squares of \d+ mm would fit"):
         page_size(BOARDS["charuco"], "a4")
     assert page_size(Board("charuco", 7, 5, 0.03, 0.021), "a4") in ((0.210, 0.297), (0.297, 0.210))

@@ -81,7 +81,8 @@ def test_another_dictionary_is_named():
     assert "no markers of 6x6_50, but some of 4x4_100" in found.problem
 
 
-def test_another_layout_is_told_from_no_board():
+def test_other_layout_is_told_from_no_board():
+    """Another layout is told from no board."""
     found = detect(image("charuco"), replace(BOARDS["charuco"], columns=6))
     assert re.search(r"\d+ markers of 4x4_50 are seen, but not where board.toml has them", found.problem)
 
@@ -93,13 +94,14 @@ def test_motion_is_told_from_defocus():
     assert "the arm was still moving" in found.problem
 
 
-def test_a_board_half_out_of_view_gives_what_is_seen():
+def test_half_visible_board_gives_its_part():
+    """A board half out of view gives what is seen."""
     found = detect(image("charuco", 25.0, -20.0, 10.0, 0.35, 0.13), BOARDS["charuco"])
     assert not found.problem and 8 <= found.seen.sum() < 24
     assert np.abs(errors(found, "charuco", 25.0, -20.0, 10.0, 0.35, 0.13)).max() < 0.3
 
 
-def test_bits_and_orientation_tags_change_nothing(tmp_path):
+def test_bits_and_orientation_change_nothing(tmp_path):
     """16 bits, colour, and a JPEG that says it is turned: the same corners."""
     grey = image("charuco")
     want = detect(grey, BOARDS["charuco"]).pixel
@@ -116,7 +118,7 @@ def test_bits_and_orientation_tags_change_nothing(tmp_path):
         assert np.nanmax(np.abs(detect(read, BOARDS["charuco"]).pixel - want)) < most
 
 
-@pytest.mark.parametrize("content, words", [(b"", "empty"), (b"\x89PNG\r\n\x1a\nxxxx", "no image format")])
+@pytest.mark.parametrize("content, words", [(b"", "empty"), (b"\x89PNG\r\n\x1a\nxxxx", "image format is unknown")])
 def test_a_corrupt_file_is_refused(content, words, tmp_path):
     (tmp_path / "bad.png").write_bytes(content)
     with pytest.raises(MeasurementError, match=words):

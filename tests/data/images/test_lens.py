@@ -42,7 +42,8 @@ def test_derivatives_and_the_inverse(name):
     assert rays(lens, pixel) == pytest.approx(place[:, :2] / place[:, 2:], abs=1e-12)
 
 
-def test_a_point_where_the_distortion_turns_back_is_out_of_sight():
+def test_folded_distortion_is_out_of_sight():
+    """A point where the distortion turns back is out of sight."""
     # r (1 - 0.4 r²) falls again beyond r = 0.91
     strong = Lens("pinhole", np.array([400.0, 400.0, *BASE[2:], -0.4, 0, 0, 0, 0]), SIZE)
     inside, beyond = np.array([[0.3, 0.0, 1.0]]), np.array([[1.5, 0.0, 1.0]])
@@ -51,7 +52,8 @@ def test_a_point_where_the_distortion_turns_back_is_out_of_sight():
 
 
 @pytest.mark.parametrize("name", LENSES)
-def test_a_lens_is_written_as_ros_reads_it_and_read_back(name, tmp_path):
+def test_lens_is_written_as_ros_reads_it(name, tmp_path):
+    """A lens is written as ROS reads it, and read back."""
     path = write_lens(LENSES[name], tmp_path / "camera.yaml")
     again = read_lens(path)
     assert np.array_equal(again.values, LENSES[name].values) and again.size == SIZE
@@ -69,13 +71,15 @@ def test_a_lens_is_written_as_ros_reads_it_and_read_back(name, tmp_path):
         (("image_width: 800", "image_width: 800: 1"), "cannot be read as YAML"),
     ],
 )
-def test_a_camera_file_that_cannot_be_is_refused_by_key(change, words, tmp_path):
+def test_impossible_camera_is_refused_by_key(change, words, tmp_path):
+    """An impossible camera file is refused by its key."""
     path = write_lens(LENSES["plain"], tmp_path / "camera.yaml")
     path.write_text(path.read_text().replace(*change))
     with pytest.raises(MeasurementError, match=words):
         read_lens(path)
 
 
-def test_a_lens_without_focal_length_is_refused():
+def test_lens_without_focal_length_refused():
+    """A lens without focal length is refused."""
     with pytest.raises(CalibError, match="focal lengths -1, 1 px"):
         Lens("pinhole", np.array([-1.0, 1.0, 0, 0, 0, 0, 0, 0, 0]), SIZE)

@@ -122,7 +122,7 @@ def half_seen(rows):
             f"{XYZ},socket", lambda rows: [[*row[:6], 0] for row in rows],
             "allows the kinds sockets, position; state one", None, None, {},
         ),
-        (TWO, half_seen, "is empty, others of x2, y2, z2 are not", 3, "y2", {}),
+        (TWO, half_seen, "is empty, unlike others of x2, y2, z2", 3, "y2", {}),
         (TWO, joints_and(*[""] * 6), "no target was seen", None, "x1", {}),
         (
             SIGMAS, lambda rows: [[*row[:6], 1e-5, 1e-5, 0 if i == 8 else 1e-5] for i, row in enumerate(rows)],
@@ -159,7 +159,8 @@ def half_seen(rows):
         (XYZ, lambda rows: [row[:6] for row in rows], "needs qx qy", None, None, {"options": FileOptions(kind="pose")}),
     ],
 )  # fmt: skip
-def test_a_spoiled_file_is_refused_at_its_cell(write, good, header, spoil, words, row, column, more):
+def test_spoiled_file_is_refused_at_its_cell(write, good, header, spoil, words, row, column, more):
+    """A spoiled file is refused at its cell."""
     refused(write(header, spoil(good)), words, row, column, **more)
 
 
@@ -178,7 +179,8 @@ def test_a_pose_outside_the_joint_limits(write, good):
     assert any("elbow is outside its limits" in note for note in block.notes)
 
 
-def test_swapped_joint_columns_show_in_the_limits(write, good):
+def test_swapped_columns_show_in_the_limits(write, good):
+    """Swapped joint columns show in the limits."""
     rows = [[row[0], 0.3 * abs(row[1]) - 2.9, *row[2:]] for row in good]
     limits = ([-2.9, -3.0, -2.9], [2.9, 0.1, 2.9])
     assert len(read_measurements(write(POSE, rows), within(limits))[0]) == 10

@@ -24,7 +24,8 @@ def write(path, seen: np.ndarray, base: np.ndarray) -> None:
     path.write_text("\n".join(lines))
 
 
-def test_the_instrument_may_move_between_rows(tmp_path):
+def test_instrument_may_move_between_rows(tmp_path):
+    """The instrument may move between rows."""
     seen, base, moves = random_poses(8, 1), random_poses(1, 2)[0], random_poses(8, 3)
     write(tmp_path / "still.csv", seen, np.broadcast_to(base, seen.shape))
     write(tmp_path / "moved.csv", moves @ seen, moves @ base)
@@ -36,7 +37,8 @@ def test_the_instrument_may_move_between_rows(tmp_path):
     assert not [name for name in moved.ignored if name.startswith("base_")]
 
 
-def test_stated_sigmas_hold_the_noise_of_both_frames():
+def test_sigmas_hold_noise_of_both_frames():
+    """Stated sigmas hold the noise of both frames."""
     seen, base = random_poses(1, 4)[0], random_poses(1, 5)[0]
     rng, sigma, sigma_rotation, count = np.random.default_rng(6), 1e-4, 3e-4, 4000
 

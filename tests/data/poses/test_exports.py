@@ -52,7 +52,8 @@ def test_positions_of_an_export(tmp_path, name, encoding):
     assert table.notes[0].startswith("read as ")
 
 
-def test_one_rigid_body_is_read_as_a_pose_and_markers_as_several_targets(tmp_path):
+def test_body_is_a_pose_markers_are_targets(tmp_path):
+    """One rigid body is read as a pose, and markers as several targets."""
     path = tmp_path / "take.csv"
     path.write_text(EXPORTS["motive"])
     assert {"qx", "qy", "qz", "qw", "x"} <= set(read_table(path).header) and "x1" not in read_table(path)

@@ -18,7 +18,8 @@ def test_defaults_without_a_file():
     assert options.for_file("any.csv") is options and options.check_limits
 
 
-def test_the_schema_of_the_docstring_is_valid_and_complete(tmp_path):
+def test_docstring_schema_is_complete(tmp_path):
+    """The schema of the docstring is valid and complete."""
     schema = (module.__doc__ or "").split("::\n", 1)[1]
     path = tmp_path / "fit.toml"
     path.write_text(re.sub(r"(?m)^    ", "", schema))
@@ -34,7 +35,8 @@ def test_the_schema_of_the_docstring_is_valid_and_complete(tmp_path):
         assert re.search(rf"(?m)^    \[?{key}\b", schema), f"{key} is not in the docstring"
 
 
-def test_a_files_table_adds_to_what_holds_for_every_file():
+def test_files_table_adds_to_common_options():
+    """A file's table adds to what holds for every file."""
     day2 = {"kind": "pose", "units": {"position": "m"}, "station": "B"}
     every = {"kind": "position", "units": {"joints": "deg", "position": "mm"}, "sigma": {"position": 1e-5}}
     options = parse_options({**every, "files": {"day2.csv": day2, "a/day3.csv": {"tool": "T"}}})
@@ -90,7 +92,8 @@ def test_files_that_are_no_toml(tmp_path):
 
 
 @pytest.mark.parametrize("sigma", [1e-300, 1e-11, 0.2, 1e300])
-def test_a_sigma_that_no_instrument_has_is_refused_in_options_and_session_alike(sigma):
+def test_implausible_sigma_is_refused(sigma):
+    """A sigma that no instrument has is refused, in options and session alike."""
     words = r"expected a number \[m\], at least 1e-10 and at most 0.1 \(are these mm, or degrees\?\), found "
     with pytest.raises(UsageError, match="sigma.position: " + words):
         parse_options({"sigma": {"position": sigma}})

@@ -49,7 +49,8 @@ def read(path, **options):
     return read_images(path, cell().cell.nominal.joint_names, parse_options(options))
 
 
-def test_corners_come_with_joints_and_are_looked_for_once(folder):
+def test_corners_are_looked_for_once(folder):
+    """Corners come with joints and are looked for once."""
     block = read(folder)
     assert is_image_folder(folder) and block.kind == "pixels" and len(block) == 7
     assert block.q == pytest.approx(joints(), abs=1e-9)
@@ -65,7 +66,8 @@ def test_corners_come_with_joints_and_are_looked_for_once(folder):
     assert (folder / "corners.csv").read_text() == before
 
 
-def test_useless_images_are_left_out_and_said_to_be(folder):
+def test_useless_images_are_left_out(folder):
+    """Useless images are left out and said to be so."""
     (folder / "0002.png").write_bytes(b"\x89PNG cut short")
     image = cv2.imread(str(folder / "0004.png"), 0)
     cv2.imwrite(str(folder / "0004.png"), np.ascontiguousarray(np.rot90(image)))
@@ -80,7 +82,8 @@ def test_useless_images_are_left_out_and_said_to_be(folder):
     assert "(no board found: out of view, hidden, blurred or in glare): 0005.png" in notes
 
 
-def test_too_few_usable_images_are_refused_with_the_reasons(folder):
+def test_too_few_images_refused_with_reasons(folder):
+    """Too few usable images are refused with the reasons."""
     for name in ("0001", "0002", "0003", "0004", "0005"):
         (folder / f"{name}.png").write_bytes(b"")
     with pytest.raises(MeasurementError, match=r"2 usable images: .*5 images are not usable .*the file is empty"):
@@ -96,17 +99,19 @@ def test_too_few_usable_images_are_refused_with_the_reasons(folder):
         (lambda f: [p.unlink() for p in f.glob("*.png")], "none of the images named in joints.csv exists"),
         (
             lambda f: write_lens(Lens(LENS.model, LENS.values, (640, 480)), f / "camera.yaml"),
-            "is for images of 640 x 480 pixels, the images here have 480 x 360",
+            "is for images of 640 x 480 pixels, but the images here have 480 x 360",
         ),
     ],
 )
-def test_a_folder_that_lacks_something_is_refused(change, words, folder):
+def test_incomplete_folder_is_refused(change, words, folder):
+    """A folder that lacks something is refused."""
     change(folder)
     with pytest.raises(MeasurementError, match=words):
         read(folder)
 
 
-def test_a_given_lens_is_kept_unless_it_is_to_be_fitted(folder):
+def test_stated_lens_is_kept_unless_fitted(folder):
+    """A stated lens is kept unless it is to be fitted."""
     write_lens(LENS, folder / "camera.yaml")
     assert read(folder).known and not read(folder).free
     fitted = read(folder, camera={"intrinsics": "fit", "board": ["bend"]})
@@ -144,7 +149,8 @@ def write_bag(path, compressed: bool, moving: int) -> None:
 
 
 @pytest.mark.parametrize("compressed", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_images_of_a_bag_take_the_joints_of_their_stamps(compressed, folder, tmp_path):
+def test_images_of_bag_take_stamped_joints(compressed, folder, tmp_path):
+    """Images of a bag take the joints of their stamps."""
     write_bag.folder = folder
     write_bag(tmp_path / "bag", compressed, moving=2)
     board = read_board(folder)
@@ -159,7 +165,8 @@ def test_images_of_a_bag_take_the_joints_of_their_stamps(compressed, folder, tmp
         read_image_bag(tmp_path / "bag", board, "/camera")
 
 
-def test_one_sentence_per_reason_tells_the_range_of_its_numbers():
+def test_reasons_tell_range_of_their_numbers():
+    """One sentence per reason tells the range of its numbers."""
     blurred = {
         f"{k}.png": f"no board found; the image's sharpest edges are {width} px wide" for k, width in ((1, 9), (2, 12))
     }

@@ -68,7 +68,8 @@ def test_a_prismatic_joint_in_millimetres(write, good):
 
 
 @pytest.mark.parametrize("suffix", ["_meas", "_measured"])
-def test_measured_columns_with_a_suffix_are_taken_and_said(write, good, suffix):
+def test_columns_with_suffix_are_taken(write, good, suffix):
+    """Measured columns with a suffix are taken, and the suffix is said."""
     header = "q1,q2,q3," + ",".join(name + suffix for name in ["x", "y", "z", "qx", "qy", "qz", "qw"]) + ",x_target"
     block = read(write(header, [[*row, 0] for row in good]))
     assert block.kind == "pose" and block.ignored == ("x_target",)
@@ -76,7 +77,8 @@ def test_measured_columns_with_a_suffix_are_taken_and_said(write, good, suffix):
 
 
 @pytest.mark.parametrize("names", [("x", "y", "z"), ("x_meas", "y_meas", "z_meas")])
-def test_commanded_beside_measured_positions_are_refused_until_the_options_say_which(write, good, names):
+def test_commanded_beside_measured_refused(write, good, names):
+    """Commanded positions beside measured ones are refused until the options say which to take."""
     path = write("q1,q2,q3,x,y,z,x_meas,y_meas,z_meas", [[*row[:6], 9, 9, 9] for row in good])
     with pytest.raises(MeasurementError, match=r'map the columns.*\[columns\] x = "x_meas"'):
         read(path)
@@ -99,9 +101,8 @@ POSITIONS, TURNS = ("x", "y", "z"), ("qx", "qy", "qz", "qw")
         ("x,y,z,qx_meas,qy_meas,qz_meas,qw_meas", {}, POSITIONS),
     ],
 )
-def test_a_plain_orientation_beside_measured_positions_is_refused_until_it_is_mapped(
-    write, good, header, mapped, plain
-):
+def test_unmapped_orientation_is_refused(write, good, header, mapped, plain):
+    """A plain orientation beside measured positions is refused until it is mapped."""
     names = header.split(",")
     matrices = Rotation.from_quat(np.array(good, dtype=float)[:, 6:]).as_matrix().reshape(-1, 9)
     turned = [[*row[6:]] if "r11" not in names else [*matrix] for row, matrix in zip(good, matrices)]
@@ -115,7 +116,8 @@ def test_a_plain_orientation_beside_measured_positions_is_refused_until_it_is_ma
     assert read(path, FileOptions(kind="position", columns=mapped)).kind == "position"
 
 
-def test_a_map_of_some_columns_is_completed_by_those_that_go_with_them(write, good):
+def test_partial_map_is_completed(write, good):
+    """A map of some columns is completed by those that go with them."""
     path = write("q1,q2,q3,x_meas,y_meas,z_meas", [row[:6] for row in good])
     block = read(path, FileOptions(columns={"x": "y_meas", "y": "x_meas"}))
     np.testing.assert_array_equal(block.position, np.array(good, dtype=float)[:, [4, 3, 5]])
@@ -125,13 +127,14 @@ def test_a_map_of_some_columns_is_completed_by_those_that_go_with_them(write, go
     "header, columns, said",
     [
         ("x_meas,y_meas,z_meas", {"x": "z_meas"}, "is read as two different columns"),
-        ("x,y,z,x_meas,y_meas,z_meas", {"x": "x_meas", "y": "y_meas"}, "z and z_meas could be it"),
+        ("x,y,z,x_meas,y_meas,z_meas", {"x": "x_meas", "y": "y_meas"}, "z and z_meas could be meant"),
         ("a,b,height", {"x": "a", "y": "b"}, "map this one"),
         ("x,y,z,qx_meas", {"qx": "qx_meas"}, "map this one"),
         ("x,y,z,std", {"sigma_distance": "std"}, "not read in a file of kind 'position'"),
     ],
 )
-def test_a_map_that_cannot_be_followed_is_refused(write, good, header, columns, said):
+def test_impossible_map_is_refused(write, good, header, columns, said):
+    """A map that cannot be followed is refused."""
     width = len(header.split(","))
     path = write(f"q1,q2,q3,{header}", [[*row[:3], *range(1, 1 + width)] for row in good])
     with pytest.raises(MeasurementError, match=said):
@@ -168,7 +171,8 @@ def test_distances_between_two_poses(write, good):
     np.testing.assert_array_equal(block.sigma, np.full(10, 2e-5))
 
 
-def test_distances_to_the_ends_of_bars_and_points_on_planes(write, good):
+def test_distances_to_bars_and_planes(write, good):
+    """Distances to the ends of bars, and points on planes."""
     block = read(write("q1,q2,q3,plane", [[*row[:3], "table"] for row in good]))
     assert block.kind == "plane" and block.group_names == ("table",) and not block.has_instrument
     rows = [[*row[:3], 500, i // 5] for i, row in enumerate(good)]
@@ -185,7 +189,8 @@ def sockets(good):
     return [[*row[:3], "left" if i < 5 else "right", i % 2] for i, row in enumerate(good)]
 
 
-def test_sockets_are_grouped_with_their_fixture(write, good):
+def test_sockets_are_grouped_with_fixture(write, good):
+    """Sockets are grouped with their fixture."""
     block = read(write(SOCKETS, sockets(good)), FileOptions(socket_distance=0.05))
     assert block.kind == "sockets" and block.group_names == ("left/0", "left/1", "right/1", "right/0")
     assert block.links == ((0, 1, 0.05), (2, 3, 0.05))
@@ -199,7 +204,7 @@ def test_socket_groups_and_pairs_by_options(write, good):
     assert block.links == ((0, 2, 0.05),)
     block = read(path, FileOptions(groups=("day",), kind="sockets"))
     assert block.group_names[:4] == ("0/0", "0/1", "0/2", "1/0")
-    assert any("group of one row" in note for note in block.notes)
+    assert any("measured in one row only" in note for note in block.notes)
 
 
 def test_where_keeps_rows_and_their_numbers(write, good):
@@ -226,7 +231,8 @@ def test_the_options_choose_among_kinds(write, good):
     assert read(path, FileOptions(kind="position")).ignored == ("qx", "qy", "qz", "qw")
 
 
-def test_sigmas_of_columns_win_and_are_raised_to_the_floor(write, good):
+def test_column_sigmas_win_above_the_floor(write, good):
+    """Sigmas of columns win and are raised to the floor."""
     rows = [[*row[:6], *row[3:6], 1e-5, 2e-5, 3e-5, 4e-5, 5e-5, 6e-5] for row in good]
     names = ",".join(f"sigma_{axis}{k}" for k in (1, 2) for axis in "xyz")
     block = read(write(f"q1,q2,q3,x1,y1,z1,x2,y2,z2,{names}", rows))
@@ -239,7 +245,8 @@ def test_sigmas_of_columns_win_and_are_raised_to_the_floor(write, good):
     np.testing.assert_array_equal(block.sigma_rotation, np.ones((10, 3)))
 
 
-def test_a_constant_quaternion_and_small_rounding_are_fine(write, good):
+def test_constant_quaternion_is_fine(write, good):
+    """A constant quaternion and small rounding are fine."""
     block = read(write(POSE, [[*row[:6], 0, 0, 0, 1.0005] for row in good]))
     np.testing.assert_allclose(block.quaternion, np.tile([0, 0, 0, 1.0], (10, 1)))
 
@@ -249,7 +256,8 @@ def test_joint_like_names_of_a_header(write):
     assert joint_columns(path) == ("id", "S", "L")
 
 
-def test_a_little_beyond_a_limit_and_radians_under_a_degree_header_are_notes(write, good):
+def test_limit_and_unit_oddities_are_notes(write, good):
+    """A little beyond a limit, and radians under a degree header, are notes."""
     limit = max(row[0] for row in good)
     block = read(write(POSE, good), limits=([-3, -3, -3], [limit - 5e-4, 3, 3]))
     assert any("shoulder is outside its limits in 1 of 10 rows" in note for note in block.notes)
@@ -257,7 +265,8 @@ def test_a_little_beyond_a_limit_and_radians_under_a_degree_header_are_notes(wri
     assert any("radians instead of degrees" in note for note in block.notes)
 
 
-def test_a_multi_turn_joint_passes_within_its_limits(write, good):
+def test_multi_turn_joint_passes_in_limits(write, good):
+    """A multi-turn joint passes within its limits."""
     rows = [[row[0], row[1], 5 * row[2], *row[3:]] for row in good]
     assert len(read(write(POSE, rows), limits=([-3, -3, -20], [3, 3, 20]))) == 10
     assert len(read(write(POSE, rows), kinds=("revolute", "revolute", "continuous"))) == 10
@@ -272,7 +281,8 @@ def test_a_multi_turn_joint_passes_within_its_limits(write, good):
         (",".join(MATRIX.names), "", lambda q: q.as_matrix().reshape(-1, 9)),
     ],
 )
-def test_orientations_in_angles_are_those_of_the_stated_convention(write, good, names, euler, turn):
+def test_angles_follow_stated_convention(write, good, names, euler, turn):
+    """Orientations in angles are those of the stated convention."""
     quaternion = np.array(good, dtype=float)[:, 6:]
     rows = [[*row[:6], *angles] for row, angles in zip(good, turn(Rotation.from_quat(quaternion)))]
     path = write(f"q1,q2,q3,x,y,z,{names}", rows)

@@ -58,7 +58,8 @@ def test_missing_and_extra_poses_are_named(plan):
     assert not unmeasured(plan, [measured(q), measured(plan[4::-1])])
 
 
-def test_several_targets_of_one_row_count_once(plan):
+def test_targets_of_one_row_count_once(plan):
+    """Several targets of one row count once."""
     found = measured(np.repeat(plan[:-1], 3, axis=0), np.repeat(np.arange(1, 40), 3))
     assert check_against(plan, found) == ()
     assert unmeasured(plan, [found])[0].startswith("1 of 40 planned poses remain to be measured: 40 (")

@@ -38,7 +38,8 @@ def test_ur10_poses(data):
     assert load(data, "ur10_ipa/A_grid_2500.csv", "model.urdf").q.shape == (2500, 6)
 
 
-def test_motoman_joints_by_name_and_uncertainties_by_options(data):
+def test_motoman_by_names_and_options(data):
+    """The Motoman's joints come by name, and its uncertainties by options."""
     joints = ["E_external", "S", "L", "U", "R", "B", "T"]
     options = FileOptions(columns={f"sigma_{axis}": f"unc_{axis}" for axis in "xyz"}, sigma=Sigma(floor=1e-6))
     block = load(data, "motoman_leica/right_wide_386.csv", "model_right.urdf", options=options)
@@ -60,4 +61,6 @@ def test_tiago_three_markers(data):
     names = ["torso_lift_joint", *(f"arm_{i}_joint" for i in range(1, 8))]
     block = load(data, "tiago_laas/mocap_35poses.csv", "model.urdf", names)
     assert block.kind == "position" and len(block) == 105 and len(block.tool_names) == 3
-    assert block.notes == ("torso_lift_joint is outside its limits in 1 of 35 rows, most in row 3, by 0.00018 m; kept",)
+    assert block.notes == (
+        "torso_lift_joint is outside its limits in 1 of 35 rows, most in row 3, by 0.00018 m; these rows are used",
+    )

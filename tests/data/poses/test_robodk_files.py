@@ -48,13 +48,15 @@ def test_poses_in_each_convention(write, numbers, euler):
     assert block.kind == "pose" and any("w p r are taken as" in note for note in block.notes)
 
 
-def test_twelve_columns_are_points_or_poses_by_the_tenth_name(write, numbers):
+def test_twelve_columns_are_points_or_poses(write, numbers):
+    """Twelve columns are points or poses by the tenth name."""
     rows = np.hstack(numbers).tolist()
     assert read(write(f"{HEAD},X,Y,Z,Rx,Ry,Rz", rows)).kind == "pose"
     assert read(write(f"{HEAD},X,Y,Z,TCPx,TCPy,TCPz", rows)).kind == "position"
 
 
-def test_angles_that_may_be_radians_are_asked_for(write, numbers):
+def test_possible_radians_are_asked_for(write, numbers):
+    """Angles that may be radians are asked for."""
     q, xyz, wpr = numbers
     path = write(f"{HEAD},X,Y,Z,W,P,R", np.hstack([q, xyz, np.deg2rad(wpr)]).tolist())
     with pytest.raises(MeasurementError, match=r"all angles are within.*units.orientation") as error:
@@ -95,7 +97,8 @@ def test_three_reflectors_without_a_header(tmp_path, numbers, padding, separator
         read(path)
 
 
-def test_three_reflectors_with_too_few_columns(tmp_path, numbers):
+def test_three_reflectors_lacking_columns(tmp_path, numbers):
+    """Three reflectors with too few columns."""
     path = tmp_path / "short.csv"
     np.savetxt(path, np.hstack(numbers), delimiter=",")
     with pytest.raises(MeasurementError, match="has 12 columns; three reflectors and 6 joints need 15"):

@@ -77,7 +77,8 @@ def test_sound_columns_are_not_remarked_upon(changed: Callable[[Log], Log] | Non
     assert column_faults(t, q, torque, v) == () == column_faults(t, q, torque)
 
 
-def test_a_clipped_torque_is_found_with_both_values():
+def test_clipped_torque_is_found():
+    """A clipped torque is found with both values."""
     t, q, torque, v = clipped(sound())
     (fault,) = column_faults(t, q, torque, v)
     assert (fault.kind, fault.joint, fault.values) == ("clipped", JOINT, (-8.0, 8.0))
@@ -85,14 +86,16 @@ def test_a_clipped_torque_is_found_with_both_values():
 
 
 @pytest.mark.parametrize(("freeze", "share"), [(frozen_position, 0.025), (frozen_throughout, 1.0)])
-def test_a_position_that_stands_beside_its_velocity_is_found(freeze: Callable[[Log], Log], share: float):
+def test_frozen_position_shows_by_velocity(freeze: Callable[[Log], Log], share: float):
+    """A position that stands still beside a velocity that does not is found."""
     t, q, torque, v = freeze(sound())
     (fault,) = column_faults(t, q, torque, v)
     assert (fault.kind, fault.joint) == ("position", JOINT)
     assert fault.share == pytest.approx(share, abs=0.002) and fault.missed > 0.25
 
 
-def test_a_position_that_stands_and_jumps_is_found_without_velocities():
+def test_frozen_position_shows_by_its_jump():
+    """A position that stands still and then jumps is found without velocities."""
     t, q, torque, v = frozen_position(sound())
     first = t[np.argmax(np.abs(v[:-100, JOINT]))]
     (fault,) = column_faults(t, q, torque)
@@ -107,7 +110,8 @@ def test_a_velocity_that_stands_is_found():
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"no recordings at {DATA}")
-def test_open_recordings_are_sound_and_clipped_ones_are_found():
+def test_only_clipped_recordings_are_found():
+    """Open recordings are sound, and clipped ones are found."""
     for path in sorted(DATA.glob("*/*.npz")):
         with np.load(path) as log:
             series = {name: log[name] for name in log.files}

@@ -57,13 +57,15 @@ def test_libfrankas_time_is_in_milliseconds(tmp_path, gap):
 
 
 @pytest.mark.parametrize("units", [{}, {"t": "s"}])
-def test_a_time_that_somebody_converted_is_in_seconds(tmp_path, units):
+def test_converted_time_is_in_seconds(tmp_path, units):
+    """A time that somebody converted is in seconds."""
     path = libfranka(tmp_path / "log.csv", per_second=1.0)
     found = read_recording(path, joints(7), RecordingOptions(units=units))
     assert found.duration == pytest.approx(0.004 * (N - 1)) and any("taken as seconds" in note for note in found.notes)
 
 
-def test_a_unit_said_twice_counts_once_and_another_is_refused(tmp_path):
+def test_unit_said_twice_counts_once(tmp_path):
+    """A unit said twice counts once, and another is refused."""
     path = libfranka(tmp_path / "log.csv")
     assert read_recording(path, joints(7), RecordingOptions(units={"t": "ms"})).duration == pytest.approx(
         0.004 * (N - 1)
@@ -73,7 +75,7 @@ def test_a_unit_said_twice_counts_once_and_another_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("separator", [" ", ","])
-def test_a_urs_recording_is_read_with_its_currents(tmp_path, separator):
+def test_ur_recording_is_read_with_currents(tmp_path, separator):
     """As CSVWriter of RTDE_Python_Client_Library writes it: names with _0 to _5, parted by blanks."""
     t, q, v, current = motion(6)
     kinds = ("target_q", "target_moment", "actual_q", "actual_qd", "actual_current")
@@ -84,7 +86,8 @@ def test_a_urs_recording_is_read_with_its_currents(tmp_path, separator):
     assert np.allclose(found.t, t, atol=1e-6) and "read as a UR's RTDE recording" in found.notes
 
 
-def test_abbs_egm_has_positions_in_degrees_and_no_torques(tmp_path):
+def test_abb_egm_is_degrees_without_torques(tmp_path):
+    """ABB's EGM has positions in degrees and no torques."""
     t, q, v, _ = motion(6)
     kinds = [f"{who}_{what}_" for who in ("R_FB", "R_PL", "S_REF") for what in ("POS", "VEL")]
     names = ["TIMESTAMP", *(f"{kind}{axis}J{k + 1}" for kind in kinds for axis in "RE" for k in range(6))]
@@ -113,7 +116,8 @@ def test_abbs_egm_has_positions_in_degrees_and_no_torques(tmp_path):
         read_recording(path, joints(6))
 
 
-def test_kukas_sunrise_log_needs_the_name_of_its_torques(tmp_path):
+def test_sunrise_log_needs_name_of_torques(tmp_path):
+    """KUKA's Sunrise log needs the name of its torques."""
     t, q, _, tau = motion(7)
     arm = "_LBR_iiwa_7_R800_1"
     names = ["ZeitInSec", "ZeitInNanoSec", *named(f"axisQMsr{arm}", 7), *named(f"tauMsr{arm}", 7)]
@@ -126,12 +130,14 @@ def test_kukas_sunrise_log_needs_the_name_of_its_torques(tmp_path):
     assert np.allclose(found.t, t, atol=1e-7) and np.allclose(found.q, q) and np.allclose(found.effort, tau)
 
 
-def test_each_known_log_says_where_it_is_published():
+def test_known_logs_say_where_published():
+    """Each known log says where it is published."""
     assert all(each["says"] and each["source"] for each in logs().values())
 
 
 @pytest.mark.parametrize("content", ["", "%", "time, success_rate, state.q[0]\n", "TIMESTAMP,R_FB_POS_RJ1,\nx\n"])
-def test_a_log_cut_short_is_refused_with_a_reason(tmp_path, content):
+def test_log_cut_short_is_refused(tmp_path, content):
+    """A log cut short is refused with a reason."""
     (tmp_path / "log.csv").write_text(content)
     with pytest.raises(MeasurementError, match=r"log\.csv"):
         read_recording(tmp_path / "log.csv", joints(7))

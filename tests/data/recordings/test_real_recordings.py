@@ -36,14 +36,16 @@ def test_every_archive_becomes_a_motion(data, file, samples, joints, kind, clock
         assert report.repeated > 700 and report.lost > 800 and report.clock.roughness["counted"] < 0.05
 
 
-def test_the_lwr_moves_at_one_frequency_and_its_second_half_repeats_the_first(data):
+def test_lwr_repeats_at_one_frequency(data):
+    """The LWR moves at one frequency, and its second half repeats the first."""
     report = report_excitation(make_motion(read_recording(data / LWR)))
     assert report.poor and report.functions == 2
     halves = [make_motion(read_recording(f"{data / LWR}@{part}")) for part in ("0:13", "13:")]
     assert repeats(*halves) > 0.8
 
 
-def test_the_panda_and_the_ur10e_do_not_repeat_but_a_loaded_run_does(data):
+def test_panda_and_ur10e_do_not_repeat(data):
+    """The Panda and the UR10e do not repeat, but a loaded run does."""
     first, rest = (make_motion(read_recording(f"{data / PANDA}@{part}")) for part in ("0:9.4", "9.4:"))
     assert repeats(first, rest) < 0.05 and not report_excitation(first).poor
     free, loaded, other = (

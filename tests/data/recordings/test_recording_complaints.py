@@ -25,7 +25,8 @@ def alarms(path) -> bool:
 
 
 @pytest.mark.parametrize("back, sign, alarm", [(False, 1, False), (True, 1, False), (True, -1, True)])
-def test_a_descending_arm_gives_energy_back_and_is_no_reversed_sign(tmp_path, back, sign, alarm):
+def test_descending_arm_is_no_reversed_sign(tmp_path, back, sign, alarm):
+    """A descending arm gives energy back and is no reversed sign."""
     series = falling(back)
     work = float((series["tau"][1:] * np.diff(series["q"], axis=0)).sum())
     assert (work < 0) != back, "the drives of the one that only comes down are paid by gravity"
@@ -34,7 +35,8 @@ def test_a_descending_arm_gives_energy_back_and_is_no_reversed_sign(tmp_path, ba
 
 
 @pytest.mark.parametrize("unit", ["Nmm", "N·mm", "N mm", "mNm"])
-def test_newton_millimetres_are_known_by_their_spellings(tmp_path, unit):
+def test_newton_millimetres_are_known(tmp_path, unit):
+    """Newton millimetres are recognised by their spellings."""
     series = falling(True)
     names = ["t", "q1", "q2", f"tau1 [{unit}]", f"tau2 [{unit}]"]
     table = np.column_stack([series["t"], series["q"], 1e3 * series["tau"]])
@@ -42,7 +44,8 @@ def test_newton_millimetres_are_known_by_their_spellings(tmp_path, unit):
     assert read_recording(tmp_path / "log.csv").effort == pytest.approx(series["tau"])
 
 
-def test_a_unit_that_a_joint_does_not_have_is_refused(tmp_path):
+def test_unit_foreign_to_joint_is_refused(tmp_path):
+    """A unit that a joint does not have is refused."""
     np.savez(tmp_path / "log.npz", **falling(True))
     for unit, kind in (("mm", "revolute"), ("deg", "prismatic")):
         with pytest.raises(MeasurementError, match=rf"unit \[{unit}\] of q does not suit b, a {kind} joint"):
@@ -50,7 +53,8 @@ def test_a_unit_that_a_joint_does_not_have_is_refused(tmp_path):
             read_recording(tmp_path / "log.npz", joints, RecordingOptions(units={"q": unit}))
 
 
-def test_a_file_that_is_no_recording_is_told_why(tmp_path):
+def test_non_recording_is_told_why(tmp_path):
+    """A file that is no recording is told why."""
     series = falling(True)
     np.savez(tmp_path / "log.npz", **{key: value[::-1] for key, value in series.items() if key != "t"}, t=-series["t"])
     with pytest.raises(MeasurementError, match="backwards in every row: reverse the order"):
@@ -71,7 +75,8 @@ def test_a_file_that_is_no_recording_is_told_why(tmp_path):
 @pytest.mark.parametrize(
     "names", ["actual_q_{} actual_current_{}", "state.q[{}] state.current[{}]", "J{}_pos J{}_current"]
 )
-def test_logs_of_controllers_are_read_whatever_parts_the_columns(tmp_path, mark, names):
+def test_logs_with_any_separator_are_read(tmp_path, mark, names):
+    """Logs of controllers are read, whatever parts the columns."""
     series = falling(True)
     q, current = names.split()
     head = ["timestamp", *(q.format(k) for k in (0, 1)), *(current.format(k) for k in (0, 1))]
@@ -90,7 +95,8 @@ def test_logs_of_controllers_are_read_whatever_parts_the_columns(tmp_path, mark,
         "q{0} q_d{0} tau_J{0} dq_d{0} tau_J_d{0} ddq_d{0}",
     ],
 )
-def test_the_reference_of_ur_and_franka_logs_is_read(tmp_path, names):
+def test_reference_of_ur_and_franka_is_read(tmp_path, names):
+    """The reference of UR and Franka logs is read."""
     series = falling(True)
     head = ["timestamp", *(name.format(k) for name in names.split() for k in (0, 1))]
     parts = [series["q"], series["q"] + 0.01, series["tau"], *(7.0 * series["q"],) * 3]
@@ -103,17 +109,19 @@ def test_the_reference_of_ur_and_franka_logs_is_read(tmp_path, names):
     assert found.v is None
 
 
-def test_what_is_nan_in_every_row_is_not_provided():
+def test_all_nan_column_is_not_provided():
+    """What is NaN in every row is not provided."""
     t = np.linspace(0.0, 2.0, 400)
     q = np.column_stack([np.sin(3.0 * t), np.cos(3.0 * t)])
     absent = np.full_like(q, np.nan)
     checked = check_recording(Recording.of(t, q, q + 1.0, v=absent))
-    assert checked.v is None and any("not provided" in note for note in checked.notes)
+    assert checked.v is None and any("NaN in every row" in note for note in checked.notes)
     with pytest.raises(MeasurementError, match=r"torque of q1, q2 is NaN in every row: its driver does not provide"):
         check_recording(Recording.of(t, q, absent))
 
 
-def test_encoder_counts_are_not_called_degrees():
+def test_encoder_counts_are_not_degrees():
+    """Encoder counts are not called degrees."""
     t = np.linspace(0.0, 2.0, 400)
     counts = 2048.0 + 600.0 * np.sin(3.0 * t)[:, None]
     with pytest.raises(MeasurementError, match="encoder counts"):

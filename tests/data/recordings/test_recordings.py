@@ -23,7 +23,8 @@ def refused(path: Path | str, pattern: str, joints: Joints | None = ROBOT, **opt
     return caught.value
 
 
-def test_an_archive_comes_back_as_it_was_written(archive, series):
+def test_archive_comes_back_as_written(archive, series):
+    """An archive comes back as it was written."""
     recording = read_recording(archive(), ROBOT)
     np.testing.assert_array_equal(recording.q, series["q"])
     np.testing.assert_array_equal(recording.effort, series["tau"])
@@ -43,7 +44,8 @@ def test_flobaroids_names_and_currents(tmp_path, series):
     assert read_recording(path, options=RecordingOptions(kind="torque")).kind == "torque"
 
 
-def test_joints_are_found_by_name_in_any_order(archive, series):
+def test_joints_found_by_name_in_any_order(archive, series):
+    """Joints are found by name in any order."""
     path = archive(joint_names=np.array(["gripper", "c", "b", "a"]), **{
         key: np.column_stack([np.zeros(2400), series[key][:, ::-1]]) for key in ("q", "dq", "tau")
     })  # fmt: skip
@@ -69,7 +71,8 @@ def test_cuts(archive, recording):
             parse_cut(wrong)
 
 
-def test_use_range_is_followed_unless_a_cut_says_otherwise(archive):
+def test_use_range_holds_unless_cut(archive):
+    """The stated `use_range` is followed unless a cut says otherwise."""
     path = archive(use_range=np.array([400, 2000]))
     recording = read_recording(path)
     assert len(recording) == 1600 and recording.t[0] == 2.0 and recording.rows[0] == 401
@@ -139,7 +142,7 @@ def test_ros2_bags_without_ros(tmp_path, series, kind):
     np.testing.assert_array_equal(recording.q, series["q"][:600])
     np.testing.assert_array_equal(recording.effort, series["tau"][:600])
     np.testing.assert_allclose(recording.t, series["t"][:600], atol=1e-9)
-    assert recording.kind == "torque" and recording.notes == ("60 messages without one of the joints are not used",)
+    assert recording.kind == "torque" and recording.notes == ("60 messages that lack a joint are not used",)
     if kind == "mcap":
         bare = next((tmp_path / "bag").glob("*.mcap"))
         np.testing.assert_array_equal(read_recording(f"{bare}@1:2", ROBOT).q, series["q"][200:400])
@@ -147,7 +150,8 @@ def test_ros2_bags_without_ros(tmp_path, series, kind):
         refused(bare, "has no joint 'elbow'", Joints(("elbow",)))
 
 
-def test_franka_ros2_bags_are_read_by_their_measured_joint_state(tmp_path, series):
+def test_franka_ros2_bags_use_measured_state(tmp_path, series):
+    """Bags of franka_ros2 are read by their measured joint state."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -254,7 +258,7 @@ def test_what_is_odd_is_noted(archive, series):
     still = series["q"].copy()
     still[:, 1] = 0.7
     (note,) = read_recording(archive(q=still, dq=None), ROBOT).notes
-    assert note.startswith("b never moves (its position is one number)")
+    assert note.startswith("b never moves (its position is constant)")
     notes = read_recording(archive(tau=-series["tau"]), ROBOT).notes
     assert any("is their sign reversed?" in note for note in notes)
     notes = read_recording(archive(tau=series["tau"] / 80), ROBOT).notes
@@ -265,7 +269,8 @@ def test_what_is_odd_is_noted(archive, series):
     assert len([note for note in read_recording(archive(), narrow).notes if "beyond its limits" in note]) == 3
 
 
-def test_recordings_and_options_are_held_to_their_shapes(recording):
+def test_recordings_and_options_have_shapes(recording):
+    """Recordings and options are held to their shapes."""
     with pytest.raises(MeasurementError, match="expected"):
         Recording(recording.t, recording.q[:, :2], recording.effort, "torque", ("a", "b", "c"))
     with pytest.raises(MeasurementError, match="not one of torque, current"):
@@ -276,7 +281,8 @@ def test_recordings_and_options_are_held_to_their_shapes(recording):
         RecordingOptions(units={"q": "grad"})
 
 
-def test_blocks_of_numbers_and_what_is_none_of_them_read_alike(tmp_path, monkeypatch):
+def test_number_blocks_and_others_read_alike(tmp_path, monkeypatch):
+    """Blocks of numbers, and what is none of them, read alike."""
     from calib.data import csv_table
 
     monkeypatch.setattr(csv_table, "_CHUNK", 4)
@@ -295,7 +301,8 @@ def test_blocks_of_numbers_and_what_is_none_of_them_read_alike(tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("rate", [100.0, pytest.param(1000.0, marks=pytest.mark.slow)])
-def test_half_an_hours_stamps_fall_on_their_grid(rate):
+def test_half_hour_stamps_fall_on_grid(rate):
+    """Half an hour's stamps fall on their grid."""
     from calib.data.recordings.recording import Recording
     from calib.data.signals.resampling import find_clock, resample
 

@@ -28,7 +28,8 @@ def sine(f: float, n: int = 4000, phase: float = 0.3) -> np.ndarray:
 
 
 @pytest.mark.parametrize("f", [0.5, 3.0, 10.0])
-def test_a_sine_in_the_band_passes_without_shift(f):
+def test_sine_in_band_passes_without_shift(f):
+    """A sine in the band passes without shift."""
     x = sine(f)
     gain = 1 / (1 + (f / 50.0) ** 8)
     inner = slice(border(RATE, 50.0), -border(RATE, 50.0))
@@ -49,7 +50,8 @@ def test_a_cutoff_beyond_nyquist_is_refused(cutoff):
 @pytest.mark.parametrize(
     ("width", "first", "second"), [(1, 1 / 6, 1 / 12), (2, 1 / 30, 1 / 90), (4, 1 / 630, 1 / 3150)]
 )
-def test_central_differences_have_the_error_they_state(width, first, second):
+def test_central_differences_state_error(width, first, second):
+    """Central differences have the error they state."""
     f = 40.0
     w = 2 * np.pi * f / RATE  # ω Δ
     x, inner = sine(f), slice(width, -width)
@@ -60,7 +62,8 @@ def test_central_differences_have_the_error_they_state(width, first, second):
     assert error == pytest.approx(second * w ** (2 * width), rel=0.1)
 
 
-def test_ends_without_neighbours_are_not_numbers():
+def test_ends_without_neighbours_are_nan():
+    """Ends without neighbours are not numbers."""
     x = slope(sine(3.0)[:, None], RATE, 3)
     assert np.isnan(x[:3]).all() and np.isnan(x[-3:]).all() and np.isfinite(x[3:-3]).all()
     assert np.isnan(curvature(np.ones(5), RATE, 3)).all()
@@ -78,7 +81,8 @@ def test_decimation_commutes_with_the_model(kind, factor):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_decimation_keeps_the_band_and_stops_what_would_fold_into_it(kind):
+def test_decimation_keeps_band_stops_aliases(kind):
+    """Decimation keeps the band and stops what would fold into it."""
     decimator = design_decimator(RATE, 10, kind)
     index = kept(np.zeros(6000, dtype=int), decimator)
     assert decimator.band == 40.0 and set(np.diff(index)) == {10}
@@ -110,14 +114,16 @@ def test_blocks_give_what_the_whole_gives(block):
 
 
 @pytest.mark.parametrize(("factor", "sparse"), [(8, 5), (3, 40), (2, 19)])
-def test_the_same_band_of_every_kth_row_alone(factor, sparse):
+def test_every_kth_row_has_same_band(factor, sparse):
+    """The same band, of every k-th row alone."""
     x = np.random.default_rng(5).normal(size=2000)
     decimator = design_decimator(RATE, factor)
     few = replace(decimator, factor=sparse * factor)
     np.testing.assert_allclose(decimate(x, few), decimate(x, decimator)[::sparse], atol=1e-14)
 
 
-def test_segments_do_not_mix_and_are_decimated_in_blocks():
+def test_segments_do_not_mix():
+    """Segments do not mix and are decimated in blocks."""
     whole, segment = np.random.default_rng(5).normal(size=(1500, 2, 3)), np.repeat([0, 1], [700, 800])
     decimator = design_decimator(RATE, 6)
     w = decimate(whole, decimator, segment)

@@ -20,7 +20,8 @@ def stamps(seed: int, dropped: float, jitter: float, count: int = 4000) -> tuple
 
 
 @pytest.mark.parametrize(("dropped", "jitter"), [(0.0, 0.1), (0.03, 0.1), (0.2, 0.05), (0.03, 0.0)])
-def test_steps_are_counted_through_jitter_and_holes(dropped, jitter):
+def test_steps_counted_through_jitter(dropped, jitter):
+    """Steps are counted through jitter and holes."""
     for seed in range(5):
         steps, t = stamps(seed, dropped, jitter)
         lattice = find_lattice(t, 101)
@@ -29,7 +30,8 @@ def test_steps_are_counted_through_jitter_and_holes(dropped, jitter):
         assert lattice.period == pytest.approx(PERIOD * (1.0 + 3e-5), rel=2e-5)
 
 
-def test_stamps_that_are_no_lattice_are_not_called_one():
+def test_irregular_stamps_are_no_lattice():
+    """Stamps that are no lattice are not called one."""
     _steps, t = stamps(0, 0.0, 0.5)
     assert find_lattice(t, 101) is None
     assert find_lattice(np.cumsum(np.random.default_rng(1).exponential(PERIOD, 4000)), 101) is None
@@ -39,7 +41,8 @@ def moving(t: np.ndarray) -> np.ndarray:
     return np.column_stack([np.sin(3.0 * t), np.cos(2.0 * t)])
 
 
-def test_rows_in_another_order_are_sorted_by_their_stamps():
+def test_rows_are_sorted_by_their_stamps():
+    """Rows in another order are sorted by their stamps."""
     t = PERIOD * np.arange(1000)
     order = np.arange(1000)
     order[[200, 201, 600, 601]] = [201, 200, 601, 600]
@@ -49,7 +52,8 @@ def test_rows_in_another_order_are_sorted_by_their_stamps():
     assert "sorted by their stamps" in sorted_log.notes[0]
 
 
-def test_stamps_that_jitter_past_each_other_leave_the_rows_in_order():
+def test_jitter_leaves_rows_in_order():
+    """Stamps that jitter past each other leave the rows in order."""
     t = PERIOD * np.arange(1000)
     late = t + 0.6 * PERIOD * np.random.default_rng(0).normal(size=1000)
     ordered = in_order(Recording.of(late, moving(t), moving(t)))
@@ -57,13 +61,15 @@ def test_stamps_that_jitter_past_each_other_leave_the_rows_in_order():
     assert (np.diff(ordered.t) >= 0.0).all() and "rows are in order" in ordered.notes[0]
 
 
-def test_two_logs_in_one_file_are_not_interleaved():
+def test_two_logs_are_not_interleaved():
+    """Two logs in one file are not interleaved."""
     t = np.concatenate([PERIOD * np.arange(500), PERIOD * np.arange(500)])
     log = Recording.of(t, moving(t), moving(t))
     assert in_order(log) is log
 
 
-def test_samples_read_twice_are_left_out_while_the_robot_moves():
+def test_samples_read_twice_are_left_out():
+    """Samples read twice are left out while the robot moves."""
     t = PERIOD * np.arange(1000)
     q = moving(t)
     again = [300, 500, 501]

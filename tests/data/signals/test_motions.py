@@ -45,7 +45,8 @@ def test_a_clean_log_gives_the_derivatives():
     assert motion.segment.max() == 0 and motion.weight.min() == 1 and motion.sampling.clock.kind == "stamps"
 
 
-def test_true_jitter_is_resampled_by_the_stamps():
+def test_true_jitter_is_resampled():
+    """True jitter is resampled by the stamps."""
     t = even()
     jittered = t + np.random.default_rng(1).uniform(-6e-4, 6e-4, len(t))
     sampled = resample(recorded(jittered, jittered))
@@ -55,7 +56,8 @@ def test_true_jitter_is_resampled_by_the_stamps():
 
 
 @pytest.mark.parametrize("measured", [True, False])
-def test_jitter_of_the_logger_alone_is_seen_through(measured):
+def test_logger_jitter_is_seen_through(measured):
+    """Jitter of the logger alone is seen through."""
     t = even()
     jittered = t + np.random.default_rng(2).uniform(-6e-4, 6e-4, len(t))
     clock = find_clock(recorded(jittered, t, measured=measured))
@@ -63,7 +65,8 @@ def test_jitter_of_the_logger_alone_is_seen_through(measured):
     assert np.std(clock.t - t) < 1e-4
 
 
-def test_samples_read_twice_and_missed_are_counted():
+def test_repeated_and_missed_are_counted():
+    """Samples read twice, and missed ones, are counted."""
     random = np.random.default_rng(3)
     k = np.cumsum(random.choice([0, 1, 2], 5000, p=[0.06, 0.88, 0.06]))
     true = k / 500
@@ -81,7 +84,8 @@ def test_samples_read_twice_and_missed_are_counted():
     assert np.abs(blind.a - waves(blind.t)[2]).std() > 3 * np.abs(motion.a - waves(motion.t)[2]).std() * 0.5
 
 
-def test_a_clock_that_is_not_there_is_refused():
+def test_missing_clock_is_refused():
+    """A clock that is not there is refused."""
     t = even()
     with pytest.raises(UsageError, match="cannot date the samples"):
         find_clock(recorded(t, t, measured=False), "counted")
@@ -89,7 +93,8 @@ def test_a_clock_that_is_not_there_is_refused():
         find_clock(recorded(t, t), "sundial")
 
 
-def test_short_gaps_are_bridged_and_long_ones_split():
+def test_short_gaps_bridged_long_ones_split():
+    """Short gaps are bridged, and long ones split."""
     t = even()
     keep = np.ones(len(t), dtype=bool)
     keep[1000:1004] = False  # 10 ms
@@ -135,7 +140,8 @@ def test_filters_that_cannot_be(options, pattern):
         make_motion(recorded(t, t), options)
 
 
-def test_proposed_cutoffs_follow_the_motion_and_the_noise():
+def test_cutoffs_follow_motion_and_noise():
+    """Proposed cutoffs follow the motion and the noise."""
     t = even(500.0, 20.0)
     proposed = propose_cutoffs(resample(recorded(t, t, noise=1e-6)))
     assert proposed.dynamics == 2.0  # lines up to 1.3 Hz, windows of 4 s
@@ -151,7 +157,7 @@ def test_proposed_cutoffs_follow_the_motion_and_the_noise():
     assert ringing.dynamics <= 2.0 and ringing.position <= 10.0  # a resonance does not raise the cut-off
 
 
-def test_the_model_holds_after_the_parallel_decimation():
+def test_model_holds_after_decimation():
     """W x = y for the true parameters, filtered and thinned alike."""
     t = even()
     motion = make_motion(recorded(t, t), FilterOptions(cutoff=40.0, band=20.0))
@@ -200,7 +206,8 @@ def test_one_frequency_is_noticed():
     assert not rich.poor and not rich.notes
 
 
-def test_a_repeat_is_recognised_however_it_is_shifted():
+def test_shifted_repeat_is_recognised():
+    """A repeat is recognised, however it is shifted."""
     t = even(200.0, 24.0)
     training = make_motion(recorded(t, t, noise=1e-5))
     late = make_motion(recorded(t, t + 3.3, noise=1e-5, seed=1))  # all lines are multiples of 0.1 Hz: a period of 10 s
@@ -213,7 +220,7 @@ def test_a_repeat_is_recognised_however_it_is_shifted():
     assert repeats(training, other) < 0.2
 
 
-def test_velocities_of_quiet_encoders_keep_the_corner_that_friction_makes():
+def test_quiet_velocities_keep_the_corner():
     """A joint reverses against Coulomb friction: the filter that suits accelerations alone makes Ia 1 % too large."""
     ia, fv, fc, rate, fine = 0.8, 1.0, 2.0, 1000.0, 10
     step, gain, damping = 1.0 / (rate * fine), (2 * np.pi * 4) ** 2 * ia, 1.6 * 2 * np.pi * 4 * ia
@@ -240,7 +247,8 @@ def test_velocities_of_quiet_encoders_keep_the_corner_that_friction_makes():
     assert off[0].max() < 0.004 < 0.008 < off[1][0]
 
 
-def test_velocities_of_noisy_encoders_are_filtered_as_positions_are():
+def test_noisy_velocities_are_filtered():
+    """Velocities of noisy encoders are filtered as positions are."""
     t = even()
     quiet, noisy = (make_motion(recorded(t, t, noise=noise)) for noise in (1e-6, 0.1))
     assert (quiet.velocity_cutoff > 2.0 * quiet.cutoff).all()

@@ -72,7 +72,7 @@ def test_answers_are_checked_as_they_come() -> None:
     given = with_answer(with_answer(given, ask["payloads"], "loaded=3.28"), ask["dynamics"], "yes")
     assert not ask["payloads"].open(given) and ask["torques"].open(given)
     found = checked(with_answer(given, ask["torques"], "both"))
-    assert found["payloads"] == {"loaded": 3.28} and found["tool"] == (0.05, 0.0, 0.05) and found["dynamics"]
+    assert found["payloads"] == {"loaded": {"mass": 3.28}} and found["tool"] == (0.05, 0.0, 0.05) and found["dynamics"]
     with pytest.raises(UsageError, match="geometry-only"):
         checked(Answers("ur5", "cmm", dynamics=False, torques="both"))
 
@@ -104,3 +104,12 @@ def test_camera_is_asked_for_its_own_place():
     for mounting, others in (("unknown", 0), ("in hand", 4), ("to-hand", 4)):
         given = with_answer(Answers("lwr4plus", "camera"), asked["camera"][1], mounting)
         assert sum(question.open(given) for question in QUESTIONS if question.name in CAMERA) == others
+
+
+def test_unknown_program_is_refused_when_typed() -> None:
+    """The question is asked again at once, so that no answer is lost at the end."""
+    ask = {question.name: question for question in QUESTIONS}
+    answers = with_answer(Answers(), ask["robot"], "lwr4plus")
+    with pytest.raises(UsageError, match=r"'0\.5' is not one of"):
+        with_answer(answers, ask["program"], "0.5")
+    assert with_answer(answers, ask["program"], "none").program == "none"

@@ -54,7 +54,8 @@ def seen_by_mujoco(path, q, site):
     return poses, torques
 
 
-def test_frames_masses_and_limits_are_those_of_mujoco(tmp_path):
+def test_frames_masses_limits_are_mujocos(tmp_path):
+    """Frames, masses and limits are those of MuJoCo."""
     path = tmp_path / "awkward.xml"
     path.write_text(AWKWARD)
     chain = urdf.read(path)
@@ -70,7 +71,8 @@ def test_frames_masses_and_limits_are_those_of_mujoco(tmp_path):
 
 
 @pytest.mark.parametrize("name", names())
-def test_what_the_toolkit_writes_as_mjcf_is_read_back(tmp_path, name):
+def test_written_mjcf_is_read_back(tmp_path, name):
+    """What the toolkit writes as MJCF is read back."""
     chain = load(name)
     path = tmp_path / f"{name}.xml"
     bodies = np.tile([0.2, 0.01, 0.02, 0.3, 0.03, 0.25, 0.1, 0.2, 0.3, 3.0], (len(chain.driven), 1))
@@ -81,7 +83,8 @@ def test_what_the_toolkit_writes_as_mjcf_is_read_back(tmp_path, name):
     assert np.abs(read.inertias - bodies).max() < 1e-9
 
 
-def test_meshes_need_not_be_there_where_masses_are_stated(tmp_path):
+def test_stated_masses_need_no_meshes(tmp_path):
+    """Meshes need not be there where masses are stated."""
     path = tmp_path / "meshes.xml"
     mesh = '<asset><mesh name="m" file="none.stl"/></asset><worldbody>'
     shape = '<inertial mass="2" pos="0 0 0" diaginertia="1 1 1"/><geom type="mesh" mesh="m"/>'
@@ -109,11 +112,11 @@ OTHER = '<geom size="0.1"/><body name="c"><joint name="k" axis="0 1 0"/><geom si
         (one_joint(TWO, OTHER, '<equality><connect body1="c" anchor="0 0 1"/></equality>'), r"closes a loop"),
         (
             one_joint(TWO, OTHER, '<equality><joint joint1="k" joint2="j" polycoef="0 1 2 0 0"/></equality>'),
-            r"equality 'number 1' of 'k' is no straight line",
+            r"equality 'number 1' of 'k' is not linear",
         ),
         (
             one_joint(TWO, OTHER, '<tendon><fixed><joint joint="k" coef="1"/></fixed></tendon>'),
-            r"a tendon moves it, which a serial arm does not have",
+            r"a tendon moves joints of the arm, which is not supported",
         ),
         (one_joint('<joint type="screw"/>'), r"MuJoCo cannot read it: .*screw"),
         ("<mujoco><worldbody/></mujoco>", r"no actuated joint"),
@@ -128,7 +131,8 @@ def test_what_is_no_serial_arm_is_refused(tmp_path, content, says):
         calib.load(path)
 
 
-def test_a_joint_that_an_equality_ties_to_another_follows_it(tmp_path):
+def test_equality_makes_a_joint_follow(tmp_path):
+    """A joint that an equality ties to another follows it."""
     path = tmp_path / "tied.xml"
     tie = '<equality><joint joint1="k" joint2="j" polycoef="0.1 -0.5 0 0 0"/></equality>'
     path.write_text(one_joint(TWO, OTHER, tie))
@@ -138,7 +142,8 @@ def test_a_joint_that_an_equality_ties_to_another_follows_it(tmp_path):
     assert [(one.ratio, one.value) for one in moving] == [(1.0, 0.0), (-0.5, 0.1)]
 
 
-def test_a_urdf_that_ends_in_xml_is_read_as_one(tmp_path):
+def test_urdf_named_xml_is_read(tmp_path):
+    """A URDF that ends in `.xml` is read as one."""
     path = tmp_path / "arm.xml"
     path.write_text('<?xml version="1.0"?><robot name="a"><link name="b"/></robot>')
     assert text(path)[0].endswith("</robot>")

@@ -41,7 +41,8 @@ def by_table(table, q):
     return result
 
 
-def test_its_poses_are_those_of_its_table_and_near_the_nominal_arms(tmp_path):
+def test_poses_are_of_table_and_near_nominal(tmp_path):
+    """A calibration's poses are those of its table and near the nominal arm's."""
     (tmp_path / "calibration.conf").write_text(written(TABLE))
     arm, nominal = urdf.read(f"{tmp_path}/calibration.conf ur_type:=ur10e"), load("ur10e")
     assert (arm.base, arm.tip, arm.joint_names) == ("base", "tool0", nominal.joint_names)
@@ -57,15 +58,16 @@ def test_its_poses_are_those_of_its_table_and_near_the_nominal_arms(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "content", "says"),
     [
-        ("", written(TABLE), r"say of which type the arm is.*one of ur3"),
-        (" ur_type:=ur5e", written(TABLE), r"axes of a ur5e are up to \d+ mm from their places: another ur_type"),
+        ("", written(TABLE), r"state the type of the arm.*one of ur3"),
+        (" ur_type:=ur5e", written(TABLE), r"axes of a ur5e would be \d+ mm from nominal: is ur_type another"),
         (" ur_type:=ur10x", written(TABLE), r"ur_type 'ur10x' is not one of .*did you mean 'ur10'"),
         (" ur_type:=ur10e", "[mounting]\n", r"is no calibration\.conf of a UR: expected delta_theta .*found 0"),
         (" ur_type:=ur10e", written(TABLE).replace("delta_d = [", "delta_d = [ nan,"), r"delta_d .*found 7"),
         (" ur_type:=ur10e", written(TABLE).replace("delta_a = [ 2", "delta_a = [ x2"), r"delta_a: .*x2"),
     ],
 )  # fmt: skip
-def test_what_is_none_or_of_another_type_is_refused(tmp_path, arguments, content, says):
+def test_other_types_are_refused(tmp_path, arguments, content, says):
+    """What is none, or of another type, is refused."""
     (tmp_path / "calibration.conf").write_text(content)
     with pytest.raises(RobotError, match=rf"calibration\.conf: .*{says}"):
         urdf.read(f"{tmp_path}/calibration.conf{arguments}")

@@ -46,7 +46,8 @@ def arm(tmp_path):
     return path
 
 
-def test_a_xacro_file_is_the_robot_that_it_expands_to(arm):
+def test_xacro_is_the_expanded_robot(arm):
+    """A xacro file is the robot that it expands to."""
     chain = calib.load(f"{arm} mass:=3").chain
     assert chain.joint_names == ("shoulder", "elbow")
     assert np.allclose(chain.inertias[:, 9], [3, 1]) and np.isclose(chain.joints[0].upper, np.pi / 2)
@@ -59,7 +60,8 @@ def test_a_changed_file_is_read_again(arm):
     assert calib.load(arm).chain.joints[1].upper == 1.5
 
 
-def test_packages_elsewhere_are_named_by_the_environment(arm, tmp_path, monkeypatch):
+def test_environment_names_packages(arm, tmp_path, monkeypatch):
+    """Packages elsewhere are named by the environment."""
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "clone").rename(tmp_path / "elsewhere/far_parts")
     (tmp_path / "elsewhere/far_parts/package.xml").unlink()
@@ -85,10 +87,14 @@ def test_a_session_keeps_the_expanded_file(arm, tmp_path):
         ("<xacro:macro name='m' params=''><xacro:m/></xacro:macro><xacro:m/></robot>", r"nested without end"),
         ("<xacro:include filename='bad.xacro'/></robot>", r"nested without end: .* includes itself"),
         ("<xacro:include filename='none.xacro'/></robot>", r"No such file"),
-        ("<link name='$(arg side)'/></robot>", r"Undefined substitution argument side; say it behind the file: side:="),
+        (
+            "<link name='$(arg side)'/></robot>",
+            r"Undefined substitution argument side; state it after the file: side:=",
+        ),
     ],
 )
-def test_what_xacro_cannot_expand_is_refused_with_its_words(tmp_path, content, says):
+def test_xacro_error_is_refused_in_its_words(tmp_path, content, says):
+    """What xacro cannot expand is refused with its words."""
     path = tmp_path / "bad.xacro"
     path.write_text(f'<robot name="a" xmlns:xacro="http://www.ros.org/wiki/xacro">{content}')
     with pytest.raises(RobotError, match=rf"bad\.xacro.*: .*{says}"):
@@ -102,6 +108,7 @@ def test_what_xacro_cannot_expand_is_refused_with_its_words(tmp_path, content, s
         ("mass:=3 heavy", r"'heavy' is no xacro argument; write name:=value"),
     ],
 )
-def test_arguments_that_the_file_does_not_have_are_refused(arm, given, says):
+def test_unknown_arguments_are_refused(arm, given, says):
+    """Arguments that the file does not have are refused."""
     with pytest.raises(RobotError, match=says):
         calib.load(f"{arm} {given}")

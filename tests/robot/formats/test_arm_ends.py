@@ -43,7 +43,7 @@ def ends(*more: str, names: list[str] | None = None, base: str | None = None) ->
         ([fixed("link_ee"), fixed("camera_link", "link_ee")], "link_ee", "end-effector"),
         ([fixed("probe"), fixed("camera")], "probe", "no gripper or sensor"),
         ([fixed("hand"), moving("finger_1", "hand"), moving("finger_2", "hand")], "link_6", "no gripper"),
-        ([fixed("a"), fixed("b"), fixed("c")], "link_6", "a, b, c hang on it; --tip"),
+        ([fixed("a"), fixed("b"), fixed("c")], "link_6", "a, b, c are attached to it; choose one"),
         ([joint("t", "fixed", "link_2", "tool0")], "link_6", "the last link"),
     ],
 )
@@ -52,9 +52,10 @@ def test_the_tip_is_the_flange(more, tip, why):
     assert (found.base, found.tip) == ("link_0", tip) and why in found.reason
 
 
-def test_tool0_on_the_second_link_is_named_and_not_taken():
+def test_tool0_on_second_link_is_not_taken():
+    """A tool0 on the second link is named and not taken."""
     found = ends(joint("t", "fixed", "link_2", "tool0"))
-    assert found.unused == ("tool0 is not taken: 4 axes follow it",)
+    assert found.unused == ("tool0 is not taken as the end: 4 axes follow it",)
     assert (
         urdf.ends(read_tree(robot(*WRIST, joint("t", "fixed", "link_2", "tool0")), "arm"), tip="tool0").tip == "tool0"
     )
@@ -105,7 +106,8 @@ def test_axes_that_look_like_a_tool_stay(more, last):
     assert urdf.parse(robot(*WRIST, *more)).joint_names[-1] == last
 
 
-def test_a_gripper_alone_and_an_arm_with_gripper_in_all_names_are_arms():
+def test_gripper_and_gripper_arm_are_arms():
+    """A gripper alone, and an arm with gripper in all names, are arms."""
     alone = robot(moving("left_finger", "palm", "l", "prismatic"), fixed("pad", "l"))
     assert urdf.parse(alone).joint_names == ("left_finger",)
     named = robot(*(joint(f"gripper_arm_{k}", "revolute", f"g{k - 1}", f"g{k}", Z) for k in range(1, 5)))
@@ -125,7 +127,8 @@ def pair(left: int, right: int, *more: str) -> str:
 
 
 @pytest.mark.parametrize("right", [6, 7])
-def test_two_arms_are_offered_by_their_flanges(right):
+def test_two_arms_are_offered_by_flanges(right):
+    """Two arms are offered by their flanges."""
     source = pair(7, right)
     with pytest.raises(RobotError, match=r"two arms: .*--tip left_tool0 or right_tool0$"):
         urdf.parse(source)
@@ -136,7 +139,8 @@ def test_two_arms_are_offered_by_their_flanges(right):
         urdf.parse(source, joint_names=[*right_names, *(f"left_{k}" for k in range(1, 8))])
 
 
-def test_a_head_or_a_track_beside_the_arm_is_none():
+def test_head_or_track_is_no_arm():
+    """A head or a track beside the arm is no arm."""
     assert urdf.parse(pair(7, 2)).tip == "left_tool0"
 
 
@@ -146,7 +150,8 @@ def test_columns_of_jaws_are_not_used():
     assert ends(fixed("tool0"), names=["joint_1", "joint_2"]).tip == "link_2"
 
 
-def test_wrong_limits_refuse_only_the_joints_of_the_arm():
+def test_wrong_limits_refuse_arm_joints_only():
+    """Wrong limits refuse only the joints of the arm."""
     wrong = '<limit lower="1" upper="0" effort="1" velocity="1"/>'
     source = robot(*WRIST, joint("camera_pan", "revolute", "link_0", "pan", Z + wrong))
     chain = urdf.parse(source)

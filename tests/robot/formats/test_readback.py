@@ -11,7 +11,8 @@ from calib.robot.library import load
 
 
 @pytest.mark.parametrize("robot", ["ur5", "lwr4plus"])
-def test_yourdfpy_puts_every_link_where_we_do(robot):
+def test_yourdfpy_agrees_on_every_link(robot):
+    """The reader yourdfpy puts every link where we do."""
     source = urdf_write.write_new(load(robot))
     own = urdf.parse(source)
     q = np.random.default_rng(0).uniform(-2.0, 2.0, (7, own.n))
@@ -27,7 +28,8 @@ def test_a_slanted_axis_is_no_disagreement():
     assert check_readback(source, "robot.urdf", own) == "Pinocchio and yourdfpy read the same poses to 1e-9"
 
 
-def test_a_second_reader_that_disagrees_refuses_and_one_that_cannot_read_is_said(monkeypatch):
+def test_disagreeing_reader_refuses(monkeypatch):
+    """A second reader that disagrees refuses, and one that cannot read is said."""
     chain = load("ur5")
     source, right = urdf_write.write_new(chain), simulators.link_poses
     place = "calib.procedure.export.geometry.link_poses"

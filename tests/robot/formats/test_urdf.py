@@ -105,7 +105,8 @@ def test_default_tip_stops_before_a_gripper():
         ([joint("f", "fixed", "one", "flange"), joint("g", "fixed", "one", "camera")], ("a",), "flange"),
     ],
 )  # fmt: skip
-def test_default_tip_beside_a_driven_linkage_or_several_leaves(more, joints, tip):
+def test_default_tip_beside_a_linkage(more, joints, tip):
+    """The default tip beside a driven linkage, or with several leaves."""
     chain = urdf.parse(robot(joint("a", "revolute", "base", "one", Z), *more))
     assert (chain.joint_names, chain.tip) == (joints, tip)
 
@@ -178,7 +179,7 @@ def arm_with(limit: str) -> str:
         (three(joint("j", "revolute", "a", "b", axis("0 0 nan"))), r'xyz="0 0 nan" of <axis> in line 2 is not 3'),
         (three(joint("j", "fixed", "a", "b", xyz="0 0")), r'xyz="0 0" of <origin> .* 3 finite numbers'),
         (three(joint("j", "fixed", "a", "b", rpy="0 x 0")), r'rpy="0 x 0" of <origin>'),
-        (three(joint("j", "fixed", "a", "b", xyz="0 0 ${h}")), r"this is a xacro file; name it so"),
+        (three(joint("j", "fixed", "a", "b", xyz="0 0 ${h}")), r"this is a xacro file; rename it"),
         ("<robot xmlns:xacro='x'><xacro:include filename='f'/></robot>", r"found <xacro:include>: this is a xacro"),
         (arm_with('<limit lower="1" upper="1"/>'), r"'j': lower limit 1 is not below"),
         (arm_with('<limit lower="one" upper="1"/>'), r'lower="one" of <limit> in line'),
@@ -193,7 +194,7 @@ def test_bad_files(source, message):
     "one, two, three, message",
     [
         (("revolute", "b"), ("revolute", ""), ("fixed", ""), r"joint 'a': the joint it mimics, 'b', comes after it"),
-        (("revolute", "b"), ("revolute", "a"), ("revolute", ""), r"joint 'a': it mimics a circle"),
+        (("revolute", "b"), ("revolute", "a"), ("revolute", ""), r"joint 'a': its <mimic> leads back to itself"),
         (("revolute", ""), ("revolute", "aa"), ("revolute", ""), r"joint 'b': it mimics 'aa', which is not a joint"),
         (("revolute", ""), ("floating", ""), ("revolute", ""), r"joint 'b': type 'floating' cannot be part of an arm"),
     ],
@@ -208,7 +209,8 @@ def test_bad_arms(one, two, three, message):
         urdf.parse(robot(*joints))
 
 
-def test_missing_and_placeholder_limits_are_infinite():
+def test_missing_limits_are_infinite():
+    """Missing and placeholder limits are infinite."""
     source = robot(
         joint("a", "revolute", "base", "one", Z + '<limit velocity="0" effort="0"/>'),
         joint("b", "revolute", "one", "two", Z + '<limit lower="-1" velocity="1e9" effort="3"/>'),
@@ -219,7 +221,8 @@ def test_missing_and_placeholder_limits_are_infinite():
     assert (a.unstated, b.unstated) == (("velocity 0", "effort 0"), ())
 
 
-def test_angles_beyond_a_full_turn_are_told_and_several_of_them_refused():
+def test_angles_beyond_a_turn_are_told():
+    """Angles beyond a full turn are told, and several of them refused."""
     one, two = (joint(name, "revolute", *ends, Z, "0 0 0.1", "90 0 0") for name, *ends in ("abc", "dcd"))
     assert "joint 'd' (line 5): rpy=\"90 0 0\" is beyond" in urdf.parse(robot(two)).remarks[0]
     with pytest.raises(RobotError, match=r"joint 'a' .*joint 'd' .*degrees"):
@@ -229,7 +232,8 @@ def test_angles_beyond_a_full_turn_are_told_and_several_of_them_refused():
 BODIES = ("base", "one", "box", "lid", "tip")
 
 
-def test_inertias_with_fixed_bodies_on_and_off_the_path():
+def test_inertias_with_fixed_bodies():
+    """Inertias with fixed bodies on and off the path."""
     source = robot(
         joint("a", "revolute", "base", "one", Z, "0 0 0.1", "0.1 0.2 0.3"),
         joint("f", "fixed", "one", "box", "", "0.1 0.2 0.3", "0.4 0.5 0.6"),
@@ -244,7 +248,8 @@ def test_inertias_with_fixed_bodies_on_and_off_the_path():
     np.testing.assert_allclose(urdf.parse(source, tip="one").inertias[0, 9], 2 + 3 + 4)
 
 
-def test_inertia_about_the_turned_frame_of_a_general_axis():
+def test_inertia_about_a_turned_frame():
+    """Inertia about the turned frame of a general axis."""
     turned = robot(
         joint("a", "revolute", "base", "one", axis("1 2 -2"), "0 0 0.1"), bodies={"one": inertial(2.0, "0.3 0.1 -0.2")}
     )
@@ -285,7 +290,8 @@ def test_real_robots_against_pinocchio(path):
         np.testing.assert_allclose(chain.inertias, pinocchio_inertias(source, chain), atol=1e-12)
 
 
-def test_a_file_cut_short_is_always_a_clear_error():
+def test_truncated_file_is_a_clear_error():
+    """A file cut short is always a clear error."""
     source = gripper()
     for end in range(0, len(source) - len("</robot>") - 1, 7):
         with pytest.raises(RobotError, match="not XML"):

@@ -11,7 +11,8 @@ EVEN = np.linspace(0, 4, 60)
 
 
 @pytest.mark.parametrize("path", [spline(WAYPOINTS), through(np.sin(EVEN[:, None] + [0, 1]), EVEN)], ids=["C2", "C4"])
-def test_derivatives_are_those_of_differences_and_the_second_is_continuous(path):
+def test_derivatives_are_of_differences(path):
+    """Derivatives are those of differences, and the second is continuous."""
     h = 1e-5
     s = np.random.default_rng(0).uniform(h, path.length - h, 50)
     for order in (1, 2):
@@ -21,7 +22,8 @@ def test_derivatives_are_those_of_differences_and_the_second_is_continuous(path)
     np.testing.assert_allclose(path(inner - 1e-9, 2), path(inner + 1e-9, 2), atol=1e-5)
 
 
-def test_a_spline_meets_its_waypoints_and_two_make_a_straight_line():
+def test_spline_meets_its_waypoints():
+    """A spline meets its waypoints, and two make a straight line."""
     path = spline(WAYPOINTS)
     np.testing.assert_allclose(path(path.knots), WAYPOINTS, atol=1e-12)
     np.testing.assert_allclose(np.diff(path.knots), np.linalg.norm(np.diff(WAYPOINTS, axis=0), axis=1))
@@ -30,7 +32,8 @@ def test_a_spline_meets_its_waypoints_and_two_make_a_straight_line():
     assert np.linalg.norm(line(np.array([0.3]), 1)) == pytest.approx(1.0)
 
 
-def test_extremes_lie_where_the_slope_is_zero():
+def test_extremes_have_zero_slope():
+    """Extremes lie where the slope is zero."""
     path = spline(np.array([[0.0, 1.0], [1.0, -1.0], [0.2, 0.7]]))
     s = np.linspace(0, path.length, 200001)
     _, values = extremes(path)
@@ -53,7 +56,8 @@ def test_bad_waypoints_are_named(points, message):
         spline(points)
 
 
-def test_waypoints_and_swings_beyond_the_limits_are_named():
+def test_swings_beyond_limits_are_named():
+    """Waypoints and swings beyond the limits are named."""
     lower, upper = CHAIN.lower, CHAIN.upper
     out = WAYPOINTS.copy()
     out[1, 3] = -2.2

@@ -19,7 +19,8 @@ def kinematics(chain):
 
 
 @pytest.mark.parametrize("chain", [CHAIN, load("ur5")], ids=["redundant", "six joints"])
-def test_the_tool_runs_straight_and_turns_about_one_axis(chain):
+def test_tool_runs_straight(chain):
+    """The tool runs straight and turns about one axis."""
     start = np.array([0.3, 0.8, 0.2, -1.4, 0.3, 0.7, 0.1])[: chain.n]
     goal = forward(chain, start[None])[0].copy()
     goal[:3, 3] += [0.1, -0.15, 0.05]
@@ -34,7 +35,7 @@ def test_the_tool_runs_straight_and_turns_about_one_axis(chain):
     np.testing.assert_allclose(found.path(np.zeros(1))[0], start, atol=1e-12)
 
 
-def test_redundancy_stays_near_the_posture_at_the_start():
+def test_redundancy_stays_near_the_start():
     """Of all postures with the tool at the end of the line none near by is nearer to the start."""
     start = WAYPOINTS[0] + 0.2
     goal = forward(CHAIN, start[None])[0].copy()
@@ -46,7 +47,8 @@ def test_redundancy_stays_near_the_posture_at_the_start():
     assert abs(null @ (q[0] - start)) < 1e-8
 
 
-def test_a_line_out_of_reach_says_where_and_by_how_much():
+def test_line_out_of_reach_says_where():
+    """A line out of reach says where and by how much."""
     goal = forward(CHAIN, WAYPOINTS[:1])[0].copy()
     goal[:3, 3] += [2.0, 0, 0]
     with pytest.raises(NothingFeasible, match=r"at \d+% of it the arm stays .* mm"):
@@ -65,7 +67,8 @@ def test_a_line_is_timed_like_any_path():
 
 
 @pytest.mark.slow
-def test_the_outer_loop_shortens_and_passes_the_waypoints():
+def test_outer_loop_passes_the_waypoints():
+    """The outer loop shortens and passes the waypoints."""
     bounds, waypoints = limits(), 0.7 * random_joints(CHAIN, 4, 2)
 
     def timer(path):
@@ -79,7 +82,9 @@ def test_the_outer_loop_shortens_and_passes_the_waypoints():
     np.testing.assert_allclose(extremes(build(WAYPOINTS, np.zeros(1)))[1], extremes(spline(WAYPOINTS))[1], atol=1e-12)
 
 
-def test_paths_without_a_timing_are_stepped_over():
+def test_untimed_paths_are_stepped_over():
+    """Paths without a timing are stepped over."""
+
     def timer(path):
         if path.length > spline(WAYPOINTS).length:
             raise NothingFeasible("no", "torque", 1.0, "N m")

@@ -19,7 +19,8 @@ LINE = spline([[0.0], [1.5]])
 @pytest.mark.parametrize(
     ("velocity", "expected"), [(np.inf, 2 * np.sqrt(1.5 / 4)), (1.0, 1.5 / 1.0 + 1.0 / 4)], ids=["bang-bang", "trapeze"]
 )
-def test_a_double_integrator_takes_its_known_shortest_time(velocity, expected):
+def test_double_integrator_is_time_optimal(velocity, expected):
+    """A double integrator takes its known shortest time."""
     found = time_optimal(LINE, cart_limits(velocity=velocity, acceleration=4.0))
     assert found.duration == pytest.approx(expected, rel=1e-5)
     assert found.active_share > 0.999
@@ -32,7 +33,7 @@ def test_a_double_integrator_takes_its_known_shortest_time(velocity, expected):
         (80.0, 0.0),
     ],
 )
-def test_a_cart_with_friction_takes_its_known_shortest_time(viscous, coulomb):
+def test_cart_with_friction_is_time_optimal(viscous, coulomb):
     """At 80 N s/m friction alone holds the speed for most of the way: a plain fixed point does not converge there."""
     cart = Cart(2.0, viscous, coulomb)
     coarse, fine = (time_optimal(LINE, cart_limits(force=10.0), cart, grid=grid) for grid in (400, 1600))
@@ -42,7 +43,8 @@ def test_a_cart_with_friction_takes_its_known_shortest_time(viscous, coulomb):
     assert fine.margins["torque"].min() >= 0
 
 
-def test_planned_torques_by_pinocchio_keep_the_limits_and_reach_them():
+def test_planned_torques_reach_the_limits():
+    """Planned torques, by Pinocchio, keep the limits and reach them."""
     bounds, known = limits(), truth("lwr4plus")["drives"]
     found = time_optimal(spline(WAYPOINTS), bounds, lwr(), rate=1000.0)
     motion = track(found.path, found.profile, 1000.0, lwr().torque)
@@ -62,7 +64,7 @@ def test_planned_torques_by_pinocchio_keep_the_limits_and_reach_them():
 
 
 @pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 8))])
-def test_any_path_is_timed_with_no_limit_crossed_and_some_limit_active(seed):
+def test_any_path_is_timed_at_a_limit(seed):
     """Strong friction and accelerations limited, by turns; the sampling is other than that of the search."""
     from calib.trajectories.timing.profile import dense
 
@@ -80,7 +82,7 @@ def test_any_path_is_timed_with_no_limit_crossed_and_some_limit_active(seed):
     assert np.isclose(checked.weights.sum(), found.duration)
 
 
-def test_shorter_than_any_slowed_down_polynomial_move():
+def test_faster_than_slowed_polynomials():
     """A quintic rest-to-rest law on the same path, slowed until it keeps the limits, takes longer."""
     path, bounds, law = spline(WAYPOINTS), limits(), lwr()
     z = np.linspace(0, 1, 2001)[1:-1]
@@ -97,7 +99,8 @@ def test_shorter_than_any_slowed_down_polynomial_move():
 
 
 @pytest.mark.slow
-def test_viscous_friction_costs_time_and_finer_grids_agree():
+def test_friction_costs_time():
+    """Viscous friction costs time, and finer grids agree."""
     path = spline(WAYPOINTS)
     free = limits(velocity=np.full(7, np.inf))
     durations = [time_optimal(path, free, lwr(factor)).duration for factor in (0.0, 1.0, 3.0)]
@@ -105,7 +108,8 @@ def test_viscous_friction_costs_time_and_finer_grids_agree():
     assert time_optimal(path, free, lwr(), grid=1500).duration == pytest.approx(durations[1], rel=2e-3)
 
 
-def test_torque_limits_below_gravity_name_the_joint_and_the_lack():
+def test_torque_below_gravity_names_joint():
+    """Torque limits below gravity name the joint and the lack."""
     weak = limits(torque=np.array([176, 20, 100, 100, 100, 38, 38.0]))
     with pytest.raises(NothingFeasible, match=r"hold still at .* joint 2 needs .* limit is 20") as caught:
         time_optimal(spline(WAYPOINTS), weak, lwr())
@@ -119,11 +123,13 @@ def test_torque_limits_below_gravity_name_the_joint_and_the_lack():
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
-def test_limits_that_allow_nothing_are_refused(value):
+def test_impossible_limits_are_refused(value):
+    """Limits that allow nothing are refused."""
     with pytest.raises(BadInput, match="velocity limit of joint 3 is"):
         limits(velocity=np.array([1, 1, value, 1, 1, 1, 1.0]))
 
 
-def test_torque_limits_without_dynamics_are_refused():
+def test_torque_limits_need_dynamics():
+    """Torque limits without dynamics are refused."""
     with pytest.raises(BadInput, match="need the robot's dynamics"):
         time_optimal(spline(WAYPOINTS), limits())
