@@ -397,13 +397,13 @@ def _command_tangent(
 
 @njit(**OPTIONS)
 def closed_loop_tangent(
-    plant, layout, model, gains, relative, reference, period, smoothing, late, every, q, v, count, out, dout
+    plant, layout, model, gains, relative, reference, encoder, period, smoothing, late, every, q, v, count, out, dout
 ):
-    """Write the noise-free motion of `loop_kernels.closed_loop` and its tangents; return a status and a period.
+    """Write the motion of `loop_kernels.closed_loop` and its tangents; return a status and a period.
 
     The period is the number of the last one reached. relative (n, c): derivatives of the logarithm of each joint's
     gains by the parameters; zero for constant gains. `out` (3, M, n): q, v, torque every `every` periods. `dout` (3, M,
-    n, c): their tangents.
+    n, c): their tangents. encoder (N, n) or (0, n): noise of the measured positions, on which the controller acts.
     """
     tree, linear, kinds = plant[0], plant[2], plant[3]
     n, c = relative.shape
@@ -412,19 +412,22 @@ def closed_loop_tangent(
     rooms, empty = _workspace(tree.shape[0], n, c), np.empty(0, dtype=np.int64)
     memory, loads = np.zeros((kinds.shape[0], 2)), np.zeros(n)
     speed, before, integral, wish, feedback = np.zeros(n), np.empty(n), np.zeros(n), np.empty(n), np.empty(n)
-    tau, waiting = np.empty(n), np.zeros((late + 1, n))
+    tau, waiting, read = np.empty(n), np.zeros((late + 1, n)), np.empty(n)
     dq, dv, dspeed, dbefore = np.zeros((n, c)), np.zeros((n, c)), np.zeros((n, c)), np.zeros((n, c))
     dintegral, dwish, dtau, dwaiting = np.zeros((n, c)), np.zeros((n, c)), np.zeros((n, c)), np.zeros((late + 1, n, c))
     sample = 0
     for k in range(count):
+        read[:] = q
+        if encoder.shape[0]:
+            read += encoder[k]
         if k == 0:
             speed[:] = v
         else:
             for j in range(n):  # rounded as in `loop_kernels.closed_loop`
-                speed[j] += smoothing * ((q[j] - before[j]) / period - speed[j])
+                speed[j] += smoothing * ((read[j] - before[j]) / period - speed[j])
             dspeed += smoothing * ((dq - dbefore) / period - dspeed)
-        before[:], dbefore[:] = q, dq
-        command(gains, reference[0, k], reference[1, k], q, speed, integral, period, feedback)
+        before[:], dbefore[:] = read, dq
+        command(gains, reference[0, k], reference[1, k], read, speed, integral, period, feedback)
         for j in range(n):
             if abs(integral[j]) < gains[5, j]:
                 dintegral[j] -= period * dq[j]
@@ -438,7 +441,7 @@ def closed_loop_tangent(
             gains,
             relative,
             reference[3, k],
-            q,
+            read,
             speed,
             dq,
             dspeed,
@@ -452,12 +455,12 @@ def closed_loop_tangent(
         )
         wish[:] = feedback
         if model.shape[0]:
-            linearise_command(tree, model, linear, reference[3, k], q, speed, work, matrix, wish)
+            linearise_command(tree, model, linear, reference[3, k], read, speed, work, matrix, wish)
         wish += reference[2, k]
         now, old = k % (late + 1), (k + 1) % (late + 1) if k >= late else 0
         for j in range(n):
             held = min(max(wish[j], -gains[4, j]), gains[4, j])
-            error = reference[0, k, j] - q[j]
+            error = reference[0, k, j] - read[j]
             if held != wish[j] and error * wish[j] > 0.0:
                 integral[j] -= period * error
                 dintegral[j] += period * dq[j]
