@@ -45,6 +45,9 @@ def exchanged_by_index(
         for position in range(len(chosen)):
             thinned = matrix - _gram(jacobians[chosen[position]][None])
             trials = _screened(jacobians, matrix, chosen, index, screen)
+            # every candidate is a member
+            if not len(trials):
+                continue
             candidate_rows = jacobians[trials]
             trial_information = thinned + candidate_rows.transpose(0, 2, 1) @ candidate_rows
             trial_merits = merits(trial_information, index)
