@@ -38,6 +38,7 @@ from calib.identification.standstill import (
     with_weights,
 )
 from calib.identification.time_folds import estimate, regimes
+from calib.identification.uncertainty.recording_noise import with_precision
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
 
@@ -196,6 +197,10 @@ def identify_model(
         if error_as_moving < CLEARLY_LESS**2 * error:
             rows, prior, first = as_moving
             marks_standstills = False
+    if prior is not None and noise is None:
+        weighed = with_precision(rows, first.std, first.inflation, prior=prior.rows)
+        if weighed[0].precision is not rows[0].precision:
+            rows, prior, first = _first_fit(weighed, find, takes_prior, noise)
     if prior is not None:
         prior = tempered_prior(find, prior, rows, regimes(rows, cases, decimator))
         first = prior.first
@@ -212,6 +217,10 @@ def identify_model(
         richer_rows = _weighed_after_standstills(
             richer_rows, cases, decimator, model.torque_rows, first, prior, column_groups
         )
+    if prior is not None and noise is None:
+        inflation = prior.tempering * first.inflation
+        prior_rows = prior.widened(len(groups))
+        richer_rows = with_precision(richer_rows, first.std, inflation, column_groups, prior_rows)
     breakaway = any((part.breakaway < 1.0).any() for part in richer_rows)
     if prior is not None and (friction.terms or breakaway):
         say("sizes beside richer friction")

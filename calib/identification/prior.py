@@ -326,7 +326,7 @@ def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.
 
 
 def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) -> np.ndarray:
-    """Return the integrated autocorrelation of each row's residuals in motion (rows,), averaged by length of cases."""
+    """Return the integrated autocorrelation of each row's residuals in motion (rows,): of those of all cases in turn."""
     row_count = all_rows[0].target.shape[1]
     total = np.zeros(row_count)
     weight = np.zeros(row_count)
@@ -335,10 +335,11 @@ def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) 
         moves = rows.standing == 0.0
         has_motion = rows.present.any(axis=0) & moves.any(axis=0)
         for row in np.flatnonzero(has_motion):
-            in_motion = residual[moves[:, row], row]
-            total[row] += len(in_motion) * inflation(in_motion)
-            weight[row] += len(in_motion)
-    return np.maximum(total / np.maximum(weight, 1.0), 1.0)
+            in_motion = residual[moves[:, row], row] * rows.precision[row]
+            squares = float(np.sum(in_motion**2))
+            total[row] += squares * inflation(in_motion)
+            weight[row] += squares
+    return np.maximum(total / np.maximum(weight, 1e-300), 1.0)
 
 
 def _shared_directions(model: RegressorModel, robot: np.ndarray, effort: np.ndarray | None) -> np.ndarray:

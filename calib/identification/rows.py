@@ -167,6 +167,7 @@ class ObservationRows:
             standstill.
         rest: weights of standstills.
         coulomb: (rows, p) columns that are Coulomb friction of a torque row.
+        precision: (rows,) factor of all rows of a recording, see `calib.identification.uncertainty.recording_noise`.
     """
 
     names: tuple[str, ...]
@@ -181,12 +182,13 @@ class ObservationRows:
     breakaway: np.ndarray
     rest: RestWeights
     coulomb: np.ndarray
+    precision: np.ndarray
 
     @property
     def weight(self) -> np.ndarray:
         """Factor (M, rows) that rows are multiplied by in estimates: 1 in motion, less at rest, 0 where not used."""
         at_rest = np.sqrt(self._frictions * self.rest.worth)
-        return np.where(self.standing > 0.0, at_rest, self.breakaway) * self.present
+        return np.where(self.standing > 0.0, at_rest, self.breakaway) * self.precision * self.present
 
     @property
     def counted(self) -> np.ndarray:
@@ -198,6 +200,13 @@ class ObservationRows:
     def _frictions(self) -> np.ndarray:
         """How many values of the friction at rest each row stands for (M, rows)."""
         return self.standing * (1.0 + self.swing / self.rest.reach)
+
+    @property
+    def weighted(self) -> np.ndarray:
+        """Return the mask (rows,) of torque rows that have other weights than 1."""
+        rests = self.standing.any(axis=0)
+        fades = (self.breakaway < 1.0).any(axis=0)
+        return rests | fades | (self.precision != 1.0)
 
     def by_recording(self, recording: int, count: int) -> ObservationRows:
         """Return rows with separate torque rows per recording: those of one `recording` of `count` are filled.
@@ -222,6 +231,7 @@ class ObservationRows:
             breakaway=breakaway,
             rest=_no_rest(count),
             coulomb=coulomb,
+            precision=np.repeat(self.precision, count),
         )
 
     def extend(self, terms: Sequence[DriveTerm], columns: np.ndarray) -> ObservationRows:
@@ -308,6 +318,7 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
         breakaway=breakaway,
         rest=_no_rest(model.rows),
         coulomb=coulomb,
+        precision=np.ones(model.rows),
     )
 
 
@@ -414,7 +425,7 @@ def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
             group = block[present] * row_count + row
             matrix = rows.matrix[present, row]
             target = rows.target[present, row]
-            if rows.standing[:, row].any() or (rows.breakaway[:, row] < 1.0).any():
+            if rows.weighted[row]:
                 weight = rows.weight[present, row]
                 matrix = matrix * weight[:, None]
                 target = target * weight

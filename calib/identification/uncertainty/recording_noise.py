@@ -1,0 +1,207 @@
+"""Torque errors of each recording: how large they are in one recording compared with all.
+
+A fast motion leaves larger residuals than a slow one (filters round off what turns quickly, friction changes its sign
+more often), so that one σ per joint weighs the rows of several recordings wrongly and states a covariance that is too
+large for one and too small for the other. With d = σ² τ, the variance of a joint's residuals times the number of them
+that count as one, the logarithms x of a joint j in recordings r are taken as
+
+    x_rj ~ N(m_j, B + s²_rj),
+
+s² from the residuals' own fourth moments and autocorrelation, and B, the variance between recordings, from those of all
+joints by moments (DerSimonian & Laird 1986, eq. 8). Each logarithm is moved towards its joint's mean as far as this
+asks, B / (B + s²): recordings alike, or too short to tell, have equal weights.
+
+How errors grow from one motion to another is seen within the recordings: a filter that rounds off, a friction that
+changes its sign a little late err in time, and leave residuals where the torque y changes quickly. A joint's variance
+is
+
+    V = v [1 - θ + θ ẏ² / mean ẏ²],
+
+θ by likelihood, or zero where a constant variance is as probable (Schwarz 1978). The bands of filters follow the motion,
+and so this share of the variance follows that of the torque, θ var y; the remaining share is noise, and stays.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from calib.estimation.robust import variance_weights
+from calib.estimation.triangles import Triangles
+from calib.estimation.whiteness import inflation
+from calib.identification.rows import ObservationRows, pool, triangulate
+from calib.identification.time_folds import covariance_root, estimate
+from calib.records import frozen
+
+WINDOW_VARIANCE = 20.0
+"""Variance of log τ times rows per τ: a window of 5 τ lags, whose sum has four times its length in it (Sokal 1997)."""
+MIN_ROWS = 8
+"""Rows in motion below which nothing is said of a recording's errors."""
+MIN_FREEDOM_SHARE = 0.1
+"""Share of the rows that parameters leave for the errors, at least."""
+ROUNDS = 3
+"""Rounds of weights and estimates."""
+
+
+class ErrorGrowth(NamedTuple):
+    """How the variance of torque errors grows with the motion, by torque row.
+
+    Attributes:
+        share: (rows,) θ, share of the variance that follows the torque's.
+        torque_variance: (rows,) variance of the torques from which it was estimated [N² m² or N²].
+    """
+
+    share: np.ndarray
+    torque_variance: np.ndarray
+
+    def factor(self, torque_variance: np.ndarray) -> np.ndarray:
+        """Return the factor (rows,) of the errors' variance on a motion whose torques have these variances (rows,)."""
+        ratio = torque_variance / np.maximum(self.torque_variance, 1e-300)
+        return 1.0 - self.share + self.share * ratio
+
+
+class ErrorSizes(NamedTuple):
+    """Logarithms (recordings, rows) of the residuals' variance times τ, and their variances; infinite: not known."""
+
+    logs: np.ndarray
+    variances: np.ndarray
+
+
+def error_sizes(
+    all_rows: Sequence[ObservationRows], values: np.ndarray, parameters: np.ndarray | None = None
+) -> ErrorSizes:
+    """Return the sizes of the torque errors by recording and torque row.
+
+    Args:
+        all_rows: rows by recording.
+        values: (p,) parameters.
+        parameters: (recordings, rows) how many parameters each recording's rows determine; None: none.
+    """
+    row_count = all_rows[0].target.shape[1]
+    logs = np.zeros((len(all_rows), row_count))
+    variances = np.full((len(all_rows), row_count), np.inf)
+    for recording, rows in enumerate(all_rows):
+        residual = rows.target - rows.matrix @ values
+        used = rows.present & (rows.standing == 0.0)
+        for row in range(row_count):
+            errors = residual[used[:, row], row]
+            if len(errors) < MIN_ROWS or not errors.any():
+                continue
+            taken = 0.0 if parameters is None else parameters[recording, row]
+            logs[recording, row], variances[recording, row] = _error_size(errors, taken)
+    return ErrorSizes(logs, variances)
+
+
+def _error_size(errors: np.ndarray, parameters: float) -> tuple[float, float]:
+    """Return the logarithm of the variance of errors (N,) times τ, and that logarithm's variance."""
+    count = len(errors)
+    squares = errors**2
+    correlated = inflation(errors)
+    freedom = max(count - correlated * parameters, MIN_FREEDOM_SHARE * count)
+    size = squares.sum() / freedom * correlated
+    spread = squares.var() / squares.mean() ** 2 * inflation(squares)
+    return float(np.log(size)), float((spread + WINDOW_VARIANCE * (correlated - 1.0)) / freedom)
+
+
+def drawn_together(sizes: ErrorSizes) -> np.ndarray:
+    """Return the logarithms (recordings, rows) moved towards each row's mean as far as their variances ask, minus it.
+
+    Zero where nothing is known.
+    """
+    weight = 1.0 / sizes.variances
+    total = np.maximum(weight.sum(axis=0), 1e-300)
+    mean = (weight * sizes.logs).sum(axis=0) / total
+    known = np.isfinite(sizes.variances)
+    freedom = np.maximum(known.sum(axis=0) - 1, 0).sum()
+    excess = float(np.sum(weight * (sizes.logs - mean) ** 2)) - freedom
+    scale = float(np.sum(total - (weight**2).sum(axis=0) / total))
+    between = max(excess, 0.0) / max(scale, 1e-300)
+    if not between > 0.0:
+        return np.zeros(sizes.logs.shape)
+    weight = np.where(known, 1.0 / (between + sizes.variances), 0.0)
+    mean = (weight * sizes.logs).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
+    share = np.where(known, between / (between + sizes.variances), 0.0)
+    return np.where(known, share * (sizes.logs - mean), 0.0)
+
+
+def with_precision(
+    all_rows: Sequence[ObservationRows],
+    std: np.ndarray,
+    inflations: np.ndarray,
+    groups: np.ndarray | None = None,
+    prior: np.ndarray | None = None,
+) -> list[ObservationRows]:
+    """Return rows weighed by their recording's errors; as they are where these do not differ.
+
+    Args:
+        all_rows: rows by recording.
+        std, inflations: (rows,) standard deviation and variance inflation of the residuals of all recordings.
+        groups: (p,) ridge group of each column, -1 for none; None: no ridges.
+        prior: (k, p + 1) whitened rows of [W y] of a prior; None without one.
+    """
+    result = list(all_rows)
+    if len(result) == 1:
+        return result
+    row_count = len(std)
+    noise = std * np.sqrt(inflations)
+    counts = np.array([part.present.sum(axis=0) for part in result], dtype=float)
+    total = np.maximum(counts.sum(axis=0), 1.0)
+    for _ in range(ROUNDS):
+        parts = [pool(triangulate([part]), row_count) for part in result]
+        factors = np.concatenate([part.factors for part in parts], axis=1)
+        joined = replace(parts[0], factors=factors, rows=np.sum([part.rows for part in parts], axis=0))
+        if groups is None:
+            groups = np.full(joined.parameters, -1)
+        values, ridges = estimate(joined, std, inflations, groups, prior)
+        root = covariance_root(joined, std, inflations, ridges, prior)
+        parameters = np.array([_parameter_counts(part, root, noise) for part in parts])
+        logs = drawn_together(error_sizes(result, values, parameters))
+        # One σ stands for all: its square is the mean of theirs.
+        common = np.log(np.sum(counts * np.exp(logs), axis=0) / total)
+        result = [replace(part, precision=frozen(np.exp(0.5 * (common - log)))) for part, log in zip(all_rows, logs)]
+    return result
+
+
+def _parameter_counts(data: Triangles, root: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Return how many parameters the rows of each group determine (rows,), tr(W C Wᵀ) / noise²."""
+    explained = data.factors[:, :, :-1] @ root
+    return np.sum(explained**2, axis=(1, 2)) / noise**2
+
+
+def error_growth(all_rows: Sequence[ObservationRows], values: np.ndarray) -> ErrorGrowth:
+    """Return how the errors of an identification with parameters (p,) grow with the torques' variance."""
+    row_count = all_rows[0].target.shape[1]
+    shares = np.zeros(row_count)
+    variances = np.zeros(row_count)
+    for row in range(row_count):
+        errors, rates, torques = [], [], []
+        for rows in all_rows:
+            used = rows.present[:, row] & (rows.standing[:, row] == 0.0) & (rows.block >= 0)
+            if used.sum() < MIN_ROWS:
+                continue
+            torque = rows.target[:, row]
+            rate = np.gradient(torque) ** 2
+            errors.append((torque - rows.matrix[:, row] @ values)[used])
+            rates.append(rate[used] * torque[used].var() / max(float(rate[used].mean()), 1e-300))
+            torques.append(np.full(used.sum(), torque[used].var()))
+        if errors:
+            variances[row] = np.concatenate(torques).mean()
+            shares[row] = _growing_share(np.concatenate(errors), np.concatenate(rates))
+    return ErrorGrowth(shares, variances)
+
+
+def _growing_share(errors: np.ndarray, rates: np.ndarray) -> float:
+    """Return the share θ of the errors' variance that is proportional to the rates (N,); 0 if that is not probable."""
+    mean_square = float(np.mean(errors**2))
+    if not mean_square > 0.0 or not rates.any():
+        return 0.0
+    squares = errors**2 / mean_square
+    shapes = np.column_stack([np.ones(len(rates)), rates / rates.mean()])
+    weights = variance_weights(squares, shapes, np.full(2, 0.5))
+    variance = shapes @ weights
+    independent = 1.0 / inflation(errors)
+    gain = 0.5 * independent * float(np.sum(squares - np.log(variance) - squares / variance))
+    if gain < 0.5 * np.log(len(errors) * independent):
+        return 0.0
+    return float(weights[1] / weights.sum())
