@@ -24,6 +24,7 @@ from calib.identification.friction.ripple import Ripple, find_all
 from calib.identification.loop import LoopResults, per_joint
 from calib.identification.methods.least_squares import LeastSquares
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
+from calib.identification.methods.recording_noise import with_precision
 from calib.identification.prediction import Dynamics, Model, predict
 from calib.identification.prior import TEMPERING, FirstFit, Prior, find_prior, first_fit, rods, tempered_prior
 from calib.identification.registry import METHODS, method_named
@@ -38,7 +39,6 @@ from calib.identification.standstill import (
     with_weights,
 )
 from calib.identification.time_folds import estimate, regimes
-from calib.identification.uncertainty.recording_noise import with_precision
 from calib.robot.calibrated import CalibratedChain, as_calibrated
 from calib.robot.chain import Chain
 

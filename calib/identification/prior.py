@@ -326,7 +326,7 @@ def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.
 
 
 def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) -> np.ndarray:
-    """Return the integrated autocorrelation of each row's residuals in motion (rows,): of those of all cases in turn."""
+    """Return the integrated autocorrelation of each row's residuals in motion (rows,), weighed by cases' squares."""
     row_count = all_rows[0].target.shape[1]
     total = np.zeros(row_count)
     weight = np.zeros(row_count)

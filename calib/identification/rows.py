@@ -167,7 +167,7 @@ class ObservationRows:
             standstill.
         rest: weights of standstills.
         coulomb: (rows, p) columns that are Coulomb friction of a torque row.
-        precision: (rows,) factor of all rows of a recording, see `calib.identification.uncertainty.recording_noise`.
+        precision: (rows,) factor of all rows of a recording, see `calib.identification.methods.recording_noise`.
     """
 
     names: tuple[str, ...]

@@ -13,7 +13,7 @@ Y S g + (∂Y/∂g φ) g. A design minimises only the part from torque errors. R
 exists, σ_j is unknown: it consists of noise, and of friction that no term models. It is taken from the limits file
 ([noise]), or as a share of the torque limits, stated or `DEFAULT_NOISE`; all predicted σ except the geometry's part are
 proportional to it. After an identification, σ_j² is the density of the errors that it left, in proportion to what the
-motion's torques ask: `calib.identification.uncertainty.recording_noise`.
+motion's torques ask: `calib.identification.methods.recording_noise`.
 """
 
 from collections.abc import Callable, Sequence

@@ -17,8 +17,8 @@ is
 
     V = v [1 - θ + θ ẏ² / mean ẏ²],
 
-θ by likelihood, or zero where a constant variance is as probable (Schwarz 1978). The bands of filters follow the motion,
-and so this share of the variance follows that of the torque, θ var y; the remaining share is noise, and stays.
+θ by likelihood, or zero where a constant variance is as probable (Schwarz 1978). The bands of filters follow the
+motion, and so this share of the variance follows that of the torque, θ var y; the remaining share is noise, and stays.
 """
 
 from collections.abc import Sequence
@@ -62,34 +62,31 @@ class ErrorGrowth(NamedTuple):
 
 
 class ErrorSizes(NamedTuple):
-    """Logarithms (recordings, rows) of the residuals' variance times τ, and their variances; infinite: not known."""
+    """Logarithms (recordings, rows) of the residuals' variance times τ, and their variances; infinite: unknown."""
 
     logs: np.ndarray
     variances: np.ndarray
 
 
-def error_sizes(
-    all_rows: Sequence[ObservationRows], values: np.ndarray, parameters: np.ndarray | None = None
-) -> ErrorSizes:
+def error_sizes(all_rows: Sequence[ObservationRows], values: np.ndarray, parameters: np.ndarray) -> ErrorSizes:
     """Return the sizes of the torque errors by recording and torque row.
 
     Args:
         all_rows: rows by recording.
         values: (p,) parameters.
-        parameters: (recordings, rows) how many parameters each recording's rows determine; None: none.
+        parameters: (recordings, rows) how many parameters each recording's rows determine.
     """
     row_count = all_rows[0].target.shape[1]
     logs = np.zeros((len(all_rows), row_count))
     variances = np.full((len(all_rows), row_count), np.inf)
     for recording, rows in enumerate(all_rows):
         residual = rows.target - rows.matrix @ values
-        used = rows.present & (rows.standing == 0.0)
+        in_motion = rows.present & (rows.standing == 0.0)
         for row in range(row_count):
-            errors = residual[used[:, row], row]
+            errors = residual[in_motion[:, row], row]
             if len(errors) < MIN_ROWS or not errors.any():
                 continue
-            taken = 0.0 if parameters is None else parameters[recording, row]
-            logs[recording, row], variances[recording, row] = _error_size(errors, taken)
+            logs[recording, row], variances[recording, row] = _error_size(errors, parameters[recording, row])
     return ErrorSizes(logs, variances)
 
 
@@ -112,17 +109,17 @@ def drawn_together(sizes: ErrorSizes) -> np.ndarray:
     weight = 1.0 / sizes.variances
     total = np.maximum(weight.sum(axis=0), 1e-300)
     mean = (weight * sizes.logs).sum(axis=0) / total
-    known = np.isfinite(sizes.variances)
-    freedom = np.maximum(known.sum(axis=0) - 1, 0).sum()
+    finite = np.isfinite(sizes.variances)
+    freedom = np.maximum(finite.sum(axis=0) - 1, 0).sum()
     excess = float(np.sum(weight * (sizes.logs - mean) ** 2)) - freedom
     scale = float(np.sum(total - (weight**2).sum(axis=0) / total))
     between = max(excess, 0.0) / max(scale, 1e-300)
     if not between > 0.0:
         return np.zeros(sizes.logs.shape)
-    weight = np.where(known, 1.0 / (between + sizes.variances), 0.0)
+    weight = np.where(finite, 1.0 / (between + sizes.variances), 0.0)
     mean = (weight * sizes.logs).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
-    share = np.where(known, between / (between + sizes.variances), 0.0)
-    return np.where(known, share * (sizes.logs - mean), 0.0)
+    share = np.where(finite, between / (between + sizes.variances), 0.0)
+    return np.where(finite, share * (sizes.logs - mean), 0.0)
 
 
 def with_precision(
@@ -175,18 +172,23 @@ def error_growth(all_rows: Sequence[ObservationRows], values: np.ndarray) -> Err
     shares = np.zeros(row_count)
     variances = np.zeros(row_count)
     for row in range(row_count):
-        errors, rates, torques = [], [], []
+        errors = []
+        rates = []
+        torque_squares = []
         for rows in all_rows:
-            used = rows.present[:, row] & (rows.standing[:, row] == 0.0) & (rows.block >= 0)
-            if used.sum() < MIN_ROWS:
+            in_motion = rows.present[:, row] & (rows.standing[:, row] == 0.0) & (rows.block >= 0)
+            if in_motion.sum() < MIN_ROWS:
                 continue
             torque = rows.target[:, row]
-            rate = np.gradient(torque) ** 2
-            errors.append((torque - rows.matrix[:, row] @ values)[used])
-            rates.append(rate[used] * torque[used].var() / max(float(rate[used].mean()), 1e-300))
-            torques.append(np.full(used.sum(), torque[used].var()))
+            residual = torque - rows.matrix[:, row] @ values
+            variance = torque[in_motion].var()
+            rate_squares = np.gradient(torque)[in_motion] ** 2
+            mean_rate = max(float(rate_squares.mean()), 1e-300)
+            errors.append(residual[in_motion])
+            rates.append(rate_squares / mean_rate * variance)
+            torque_squares.append(np.full(len(rate_squares), variance))
         if errors:
-            variances[row] = np.concatenate(torques).mean()
+            variances[row] = np.concatenate(torque_squares).mean()
             shares[row] = _growing_share(np.concatenate(errors), np.concatenate(rates))
     return ErrorGrowth(shares, variances)
 
