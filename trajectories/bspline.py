@@ -1,6 +1,8 @@
-"""Periodic B-splines, with the interface of `calib.trajectories.fourier`.
+"""Periodic B-splines, with the same interface as the Fourier series of `calib.trajectories.fourier`.
 
-q_j(t) = Σ_{i=1}^{C} c_ji B_i(t),    uniform knots over one period, B_i periodic of a stated degree (5: smooth jerk)
+    q_j(t) = Σ_{i=1}^{C} c_ji B_i(t)
+
+The knots are uniform over one period, and the basis functions B_i are periodic and of a given degree (5: smooth jerk).
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,13 +17,13 @@ from .errors import BadInput, require
 
 @dataclass(frozen=True, eq=False)
 class BSpline:
-    """Family of periodic splines as joint motions.
+    """Family of joint motions as periodic splines.
 
     Attributes:
         period: T0 [s].
-        counts: (n,) control points C of each joint; 1 holds the joint at a constant.
+        counts: (n,) number C of control points of each joint; 1 locks the joint at a constant value.
         degree: degree of the polynomial pieces.
-        freedoms: for each joint, the control points that satisfy its equations.
+        freedoms: for each joint, the control points that satisfy the equations of rest and start value.
     """
 
     period: float
@@ -34,7 +36,7 @@ class BSpline:
         return len(self.counts)
 
     def basis(self, times: np.ndarray) -> Basis:
-        """Return the family's basis at times (N,) [s]."""
+        """Return the linear map from variables to motion at times (N,) [s]."""
         tables = [_table(times, self.period, count, self.degree) for count in self.counts]
         return assemble(times, tables, self.freedoms)
 
@@ -43,11 +45,11 @@ class BSpline:
         return joined(self.freedoms, x)
 
     def variables(self, coefficients: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the variables (p,) whose control points are nearest to the given ones."""
+        """Return the variables (p,) whose control points are nearest to the given control points."""
         return projected(self.freedoms, coefficients)
 
     def evaluate(self, x: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
-        """Return d^r q / dt^r (N, n) from the control points by de Boor's recursion, without the tables."""
+        """Return d^r q / dt^r (N, n) from the control points by de Boor's recursion, without the coefficient tables."""
         result = np.zeros((len(times), self.n))
         for j, (count, points) in enumerate(zip(self.counts, self.coefficients(x))):
             if count == 1:
@@ -65,8 +67,8 @@ class BSpline:
     def largest(self, x: np.ndarray, order: int) -> np.ndarray:
         """Return a bound (n,) on abs(d^r q / dt^r): the largest control point of the r-th derivative.
 
-        The derivative of a uniform spline has control points Δc / h one degree lower (de Boor), and a spline lies in
-        the hull of its control points.
+        The derivative of a uniform spline is a spline one degree lower with control points Δc / h (de Boor), and a
+        spline lies in the convex hull of its control points.
         """
         bounds = []
         for count, points in zip(self.counts, self.coefficients(x)):
@@ -77,7 +79,10 @@ class BSpline:
         return np.array(bounds)
 
     def random(self, rng: np.random.Generator, centre: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
-        """Return variables (p,) of a random motion about `centre` (n,), control points spread by `amplitude` (n,)."""
+        """Return the variables (p,) of a random motion about `centre` (n,).
+
+        The control points are spread by `amplitude` (n,).
+        """
         points = []
         for count, middle, size in zip(self.counts, centre, amplitude):
             points.append(middle + size * rng.normal(size=count))
@@ -95,10 +100,10 @@ def bspline_family(
     held: Mapping[int, float] | None = None,
     rate: float | None = None,
 ) -> BSpline:
-    """Return the family of periodic splines with `points` control points (one number, or (n,); 1 locks a joint).
+    """Return the family of periodic splines with the given numbers of control points.
 
     Args:
-        points: control points of all joints, or of each joint; more than the degree, or 1.
+        points: number of control points, one number for all joints or (n,); more than the degree, or 1 to lock a joint.
         period, joints, rest, start, held, rate: as for `calib.trajectories.fourier.fourier_family`.
         degree: 5 or more, so that the jerk has no kinks.
 
@@ -131,7 +136,7 @@ def bspline_family(
 
 
 def _table(times: np.ndarray, period: float, count: int, degree: int) -> np.ndarray:
-    """Return the derivatives (4, N, count) of q, v, a, jerk with respect to the control points."""
+    """Return the derivatives (4, N, count) of q, v, a, jerk at times (N,) with respect to the control points."""
     result = np.zeros((4, len(times), count))
     if count == 1:
         result[0] = 1.0

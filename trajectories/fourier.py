@@ -2,7 +2,7 @@
 
     q_j(t) = q_j0 + Σ_{k=1}^{n_f,j} a_jk sin(k ω0 t) + b_jk cos(k ω0 t),      ω0 = 2π / T0
 
-Rest at the start, and by periodicity at the end: Σ k a_jk = 0 and Σ k² b_jk = 0.
+The motion is at rest at the start, and by periodicity at the end, where Σ k a_jk = 0 and Σ k² b_jk = 0.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,12 +16,13 @@ from .errors import BadInput, require
 
 @dataclass(frozen=True, eq=False)
 class Fourier:
-    """A family of Fourier series.
+    """Family of joint motions as finite Fourier series.
 
     Attributes:
         period: T0 [s].
-        harmonics: (n,) n_f of each joint; 0 holds the joint at a constant.
-        freedoms: for each joint, the coefficients that satisfy its equations, ordered q0, a_1 … a_nf, b_1 … b_nf.
+        harmonics: (n,) number n_f of harmonics of each joint; 0 locks the joint at a constant value.
+        freedoms: for each joint, the coefficients that satisfy the equations of rest and start value, ordered q0, a_1 …
+            a_nf, b_1 … b_nf.
     """
 
     period: float
@@ -33,7 +34,7 @@ class Fourier:
         return len(self.harmonics)
 
     def basis(self, times: np.ndarray) -> Basis:
-        """Return the family's basis at times (N,) [s]."""
+        """Return the linear map from variables to motion at times (N,) [s]."""
         tables = [_table(times, self.period, count) for count in self.harmonics]
         return assemble(times, tables, self.freedoms)
 
@@ -42,11 +43,11 @@ class Fourier:
         return joined(self.freedoms, x)
 
     def variables(self, coefficients: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the variables (p,) whose coefficients are nearest to the given ones."""
+        """Return the variables (p,) whose coefficients are nearest to the given coefficients."""
         return projected(self.freedoms, coefficients)
 
     def evaluate(self, x: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
-        """Return d^r q / dt^r (N, n) from eq. 23 term by term, without the tables."""
+        """Return d^r q / dt^r (N, n) of order r from eq. 23 term by term, without the coefficient tables."""
         return evaluate(self.coefficients(x), self.period, times, order)
 
     def largest(self, x: np.ndarray, order: int) -> np.ndarray:
@@ -60,7 +61,10 @@ class Fourier:
         return np.array(bounds)
 
     def random(self, rng: np.random.Generator, centre: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
-        """Return variables of a random motion about a centre (n,); amplitudes (n,) spread over the harmonics as 1/k."""
+        """Return the variables (p,) of a random motion about a centre (n,).
+
+        The amplitudes (n,) are distributed over the harmonics k in proportion to 1/k.
+        """
         coefficients = []
         for count, middle, size in zip(self.harmonics, centre, amplitude):
             fall = 1.0 / np.arange(1, count + 1)
@@ -85,18 +89,19 @@ def fourier_family(
     """Return the family of Fourier series with a given period.
 
     Args:
-        harmonics: n_f, one number for all joints or (n,); 0 locks a joint.
+        harmonics: number n_f of harmonics, one number for all joints or (n,); 0 locks a joint.
         period: T0 [s].
-        joints: n, where `harmonics` is one number.
-        rest: velocity and acceleration are zero at t = 0 and T0, whatever the variables.
-        start: (n,) pose to start from [rad or m]; None: free.
-        held: indices (from 0) of joints that do not move, with their values [rad or m].
-        resonance: smallest resonance frequency ω_r [rad/s]; n_f ω0 has to be below it (the paper, section 4.3).
-        rate: sampling rate of the controller [Hz]; a period has to be a whole number of samples.
+        joints: number n of joints, needed where `harmonics` is one number.
+        rest: True: velocity and acceleration are zero at t = 0 and T0 for all variables.
+        start: (n,) pose at the start [rad or m]; None leaves it free.
+        held: indices (from 0) of locked joints, with their values [rad or m]; None locks no joint.
+        resonance: smallest resonance frequency ω_r [rad/s]; n_f ω0 must be below it (Kolyubin et al. 2019, section
+            4.3). None: not checked.
+        rate: sampling rate of the controller [Hz]; a period must be a whole number of samples. None: not checked.
 
     Raises:
-        BadInput: a period that is not positive, frequencies beyond the resonance, or a period of no whole number of
-            samples.
+        BadInput: a period that is not positive, frequencies above the resonance, or a period that is not a whole number
+            of samples.
     """
     counts = counts_of_joints(harmonics, joints)
     if not counts or min(counts) < 0 or max(counts) < 1:
@@ -116,7 +121,7 @@ def fourier_family(
 
 
 def _table(times: np.ndarray, period: float, count: int) -> np.ndarray:
-    """Return the derivatives (4, N, 1 + 2 count) of q, v, a, jerk with respect to q0, a, b."""
+    """Return the derivatives (4, N, 1 + 2 count) of q, v, a, jerk at times (N,) with respect to q0, a, b."""
     rates = 2 * np.pi / period * np.arange(1, count + 1)
     angle = np.outer(times, rates)
     sine = np.sin(angle)
@@ -131,7 +136,7 @@ def _table(times: np.ndarray, period: float, count: int) -> np.ndarray:
 
 
 def evaluate(coefficients: Sequence[np.ndarray], period: float, times: np.ndarray, order: int = 0) -> np.ndarray:
-    """Return d^r q / dt^r (N, n) directly from eq. 23, independent of tables and null spaces."""
+    """Return d^r q / dt^r (N, n) of order r directly from eq. 23, without the coefficient tables."""
     max_order = max(len(c) // 2 for c in coefficients)
     rates = 2 * np.pi / period * np.arange(1, max_order + 1)
     # each derivative turns sine and cosine by π/2

@@ -1,4 +1,4 @@
-"""Cone programs: least squares under linear constraints and positive semidefinite matrices, solved by Clarabel."""
+"""Cone programs solved by Clarabel: least squares under linear constraints and semidefinite matrix constraints."""
 
 # pyright: reportAttributeAccessIssue=false
 # clarabel is a compiled extension without stubs
@@ -26,7 +26,14 @@ MAX_MOVE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ConeOptimum:
-    """Optimum b (p,) of a cone program, with multipliers of its rows (c,), matrices (k, n, n) and equalities (e,)."""
+    """Optimum of a cone program with the Lagrange multipliers of its constraints.
+
+    Attributes:
+        values: (p,) optimal unknowns b.
+        rows: (c,) multipliers of the linear inequalities, >= 0.
+        matrices: (k, n, n) multipliers of the semidefinite constraints, symmetric.
+        equalities: (e,) multipliers of the linear equalities.
+    """
 
     values: np.ndarray
     rows: np.ndarray
@@ -44,19 +51,19 @@ def minimise(
     equality_rows: np.ndarray | None = None,
     equality_values: np.ndarray | None = None,
 ) -> ConeOptimum:
-    """Minimise ½ ‖R b - z‖² under A b + c >= 0, E b = d and M_k(b) ⪰ λ 1; no squares are formed.
+    """Minimise ½ ‖R b - z‖² over b (p,) subject to A b + c >= 0, E b = d and M_k(b) ⪰ λ_k 1.
 
-    t = R b - z is added to the unknowns.
+    RᵀR is never formed: t = R b - z is added to the unknowns of the program.
 
     Args:
-        upper, target: R (m, p), z (m,), scaled to order one.
-        rows, offset: A (c, p), c (c,).
-        matrices: (k, n, n, p) coefficients A_kj of M_k = Σ_j A_kj b_j.
-        least: λ, one number or (k,).
-        equality_rows, equality_values: E (e, p), d (e,); None without equalities.
+        upper, target: R (m, p) and z (m,), scaled to order one.
+        rows, offset: A (c, p) and c (c,).
+        matrices: (k, n, n, p) coefficients A_kj of M_k(b) = Σ_j A_kj b_j.
+        least: lower bound λ of the eigenvalues of the M_k, one number or (k,).
+        equality_rows, equality_values: E (e, p) and d (e,); None without equalities.
 
     Raises:
-        NotConverged: where no point satisfies all constraints.
+        NotConverged: if no b satisfies all constraints, or Clarabel finds no optimum.
     """
     import clarabel
     from scipy import sparse
@@ -90,10 +97,16 @@ def minimise(
         if solution is not None and str(solution.status) in FINAL:
             break
     if solution is None:
-        raise NotConverged("the constraints are not solvable to any accuracy: Clarabel's eigenvalues do not converge")
+        raise NotConverged(
+            "the constraints are not solvable to any accuracy: Clarabel's eigenvalues do not converge; relax or "
+            "remove constraints"
+        )
     values = np.array(solution.x)[:p]
     if str(solution.status) not in OPTIMAL:
-        raise NotConverged(f"the constraints may contradict each other: Clarabel reports {solution.status}", values)
+        raise NotConverged(
+            f"the constraints may contradict each other: Clarabel reports {solution.status}; relax or remove some",
+            values,
+        )
     dual = np.array(solution.z)
     matrix_multipliers = np.zeros((size, n, n))
     matrix_multipliers[:, i, j] = dual[end_of_rows:].reshape(size, len(i)) / weight
@@ -107,9 +120,9 @@ def minimise(
 
 
 def _solved(solver: "clarabel.DefaultSolver") -> "clarabel.DefaultSolution | None":
-    """Return Clarabel's solution; None where it panics, as an eigenvalue computation of LAPACK breaks down.
+    """Return Clarabel's solution; None if Clarabel panics because an eigenvalue computation of LAPACK fails.
 
-    Whether this happens at an extreme step depends on the processor's kernels of LAPACK.
+    Whether such a failure happens depends on the processor, since LAPACK's kernels differ.
     """
     try:
         return solver.solve()
@@ -121,14 +134,14 @@ def _solved(solver: "clarabel.DefaultSolver") -> "clarabel.DefaultSolution | Non
 
 
 def from_free(factor: np.ndarray, free: np.ndarray, normals: np.ndarray, sides: np.ndarray) -> np.ndarray:
-    """Return the estimate under A b = d from the unconstrained estimate b_f.
+    """Return the least-squares estimate under the equalities A b = d, computed from the unconstrained estimate b_f.
 
         b_f - Q⁻¹Aᵀ (A Q⁻¹ Aᵀ)⁻¹ (A b_f - d),    Q = RᵀR
 
-    (Gouriéroux & Monfort 1995, section 10.3); under inequalities with A and d of the binding ones.
+    (Gouriéroux & Monfort 1995, section 10.3). For inequalities, A and d are the rows of the binding ones.
 
     Args:
-        factor: (p + 1, p + 1) triangle [R z; 0 ρ].
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem.
         free: (p,) unconstrained estimate b_f.
         normals: A (k, p), of full rank.
         sides: d (k,).
@@ -143,14 +156,19 @@ def from_free(factor: np.ndarray, free: np.ndarray, normals: np.ndarray, sides: 
 
 
 def bounded(factor: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return argmin ‖R x - z‖² (p,) under A x >= 0, exact on the rows that Clarabel finds binding.
+    """Return argmin ‖R x - z‖² (p,) subject to A x >= 0.
 
-    Where this is degenerate (a multiplier would change its sign, or another row be violated), Clarabel's solution is
-    returned as it is.
+    Clarabel finds which rows of A bind; x is then computed from the equalities A x = 0 of these rows, without
+    Clarabel's tolerance. If that point is not optimal (a multiplier is negative, another row is violated, or the point
+    is far from Clarabel's), Clarabel's solution is returned.
 
     Args:
-        factor: (p + 1, p + 1) triangle [R z; 0 ρ], R of full rank.
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] with R of full rank.
         rows: A (c, p); a row with a single non-zero entry is satisfied exactly.
+
+    Raises:
+        Unidentifiable: if R is singular.
+        NotConverged: if Clarabel finds no optimum.
     """
     p = len(factor) - 1
     norms = np.linalg.norm(factor[:p, :p], axis=0)

@@ -1,4 +1,4 @@
-"""Identification of a model from cases: base parameters, selected friction, estimate with covariance, prediction."""
+"""Identification of a model from recordings: base parameters, selected friction, and estimate with covariance."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -60,16 +60,16 @@ class Identification(Generic[Model]):
     Attributes:
         dynamics: the model with its parameter values.
         base: base columns selected from the standard model, and their regrouping.
-        fitted: the estimate of base parameters and friction.
-        elimination: the steps to the essential parameters; None if not requested.
-        friction: richer friction selected on held-out time.
+        fitted: the estimate of base parameters and additional friction.
+        elimination: the elimination to the essential parameters; None if not requested.
+        friction: additional friction terms selected on held-out time.
         settings: settings of the identification.
         rows: observation rows of the training data.
         terms: the drive term of each estimated parameter; None for parameters of bodies.
         condition: condition numbers of the base parameters' observation matrix, as it is and with columns of unit norm.
         prior: prior of the base parameters; None if unused.
         ripples: gear ripple above the identification band, by joint; not part of the estimate's covariance.
-        loop: results of simulating the recordings' closed loop, where one is stated.
+        loop: results of simulating the recordings' closed loop; empty if none is stated.
     """
 
     dynamics: Dynamics[Model]
@@ -87,7 +87,7 @@ class Identification(Generic[Model]):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the estimate's parameters: base parameters, then richer friction."""
+        """Names of the estimated parameters: base parameters, then additional friction."""
         friction_names = [term.name for term in self.friction.terms]
         return (*self.base.names, *friction_names)
 
@@ -101,11 +101,15 @@ def identify(
     """Return the dynamics of a robot identified from recordings, on its calibrated geometry.
 
     Args:
-        robot: the chain that a geometric fit returns, or a nominal chain. Base columns are chosen on its nominal
-            geometry; joint corrections take part where the cases have the links' motion.
+        robot: the chain of a geometric fit, or a nominal chain. Base columns are chosen on its nominal geometry. Joint
+            corrections are used if the cases contain the motion of the links.
         cases: training recordings.
-        settings: settings of the identification; None: those that suit a serial arm with motor torques.
-        progress: called with a short text at each stage; None: not called.
+        settings: settings of the identification; None: the defaults, for a serial arm with motor torques.
+        progress: function that is called with a short text at each stage; None: not called.
+
+    Raises:
+        UsageError, MeasurementError: for settings or recordings that cannot be used.
+        CalibError: the method's failure, if there is no estimate.
     """
     settings = settings or IdentificationSettings()
     robot = as_calibrated(robot)
@@ -144,26 +148,28 @@ def identify_model(
 ) -> Identification[RegressorModel]:
     """Return the identification of a model, linear in its parameters, from recordings.
 
-    Base columns, prior, richer friction, the method's estimate, ripple, essential parameters: a sequence of steps
-    around one method, which states which of them it accepts.
+    The steps are base columns, prior, additional friction, the method's estimate, ripple, and essential parameters. The
+    method states which of them it supports.
 
     Args:
         model: model of a serial chain, or any other `RegressorModel`.
         cases: training recordings, with the torques of the model's rows as targets.
         settings: settings of the identification; drives, payloads and gravity are taken from `model`.
         nominal: the same model on the geometry on which base columns are chosen; None: `model`.
-        states: states at which base columns are compared; None: the model's random states.
-        cad: the bodies' parameters from the robot's description; None where it has no masses.
-        shape: the bodies' parameters of a robot of one kilogram, where there are no CAD values; None: not known.
-        effort: (n,) torque limits of the joints, up to a factor; None: not known.
-        progress: called with a short text at each stage; None: not called.
+        states: states at which base columns are compared; None: random states of the model.
+        cad: the bodies' parameters from the robot's description; None if it has no masses.
+        shape: the bodies' parameters of a robot of this geometry with a mass of 1 kg, used without CAD values; None:
+            unknown.
+        effort: (n,) torque limits of the joints, up to a factor; None: unknown.
+        progress: function that is called with a short text at each stage; None: not called.
 
     Raises:
-        CalibError: the method's failure, where there is no estimate.
+        UsageError, MeasurementError: for settings or recordings that cannot be used.
+        CalibError: the method's failure, if there is no estimate.
     """
     settings = settings or IdentificationSettings()
     say = progress or (lambda message: None)
-    require(cases, "no recording to identify the model from", UsageError)
+    require(cases, "no recording to identify the model from: give at least one", UsageError)
     method = method_named(settings.method)
     settings = require_usable(settings, method)
     _require_constrainable(method, settings)
@@ -199,7 +205,7 @@ def identify_model(
             marks_standstills = False
     if prior is not None and noise is None:
         weighed = with_precision(rows, first.std, first.inflation, prior=prior.rows)
-        if weighed[0].precision is not rows[0].precision:
+        if any((part.precision != 1.0).any() for part in weighed):
             rows, prior, first = _first_fit(weighed, find, takes_prior, noise)
     if prior is not None:
         prior = tempered_prior(find, prior, rows, regimes(rows, cases, decimator))
@@ -248,7 +254,14 @@ def identify_model(
 def _first_fit(
     rows: list[ObservationRows], find: Callable[..., Prior], takes_prior: bool, noise: np.ndarray | None
 ) -> _Fitted:
-    """Return the rows with their prior (None where the method takes none) and their first fit."""
+    """Return the rows with their prior (None if the method uses none) and their first fit.
+
+    Args:
+        rows: rows of all recordings.
+        find: function of the rows that returns their prior.
+        takes_prior: whether to use a prior.
+        noise: (rows,) stated torque noise; None: from the residuals.
+    """
     if takes_prior:
         prior = find(rows)
         return rows, prior, prior.first
@@ -258,7 +271,7 @@ def _first_fit(
 def _left_out_error(
     fitted: _Fitted, reference_rows: Sequence[ObservationRows], settings: IdentificationSettings
 ) -> float:
-    """Return the error of a first fit on the reference rows of time blocks left out of it."""
+    """Return the cross-validated squared error of a first fit on the reference rows of held-out time blocks."""
     rows, prior, first = fitted
     prior_rows = None
     if prior is not None:
@@ -275,13 +288,16 @@ def _weighed_after_standstills(
     prior: Prior,
     column_groups: np.ndarray,
 ) -> list[ObservationRows]:
-    """Return the rows with lower weights after standstills, where friction at rest still decays.
+    """Return the rows with lower weights shortly after standstills, where the friction at rest still decays.
 
-    The decay is estimated from residuals with richer friction, which explains slow motion, too.
+    The decay is estimated from residuals of a fit with additional friction, which also explains slow motion.
 
     Args:
-        rows: rows of all recordings, richer friction included.
-        first: the fit from which the joints' weights come.
+        rows: rows of all recordings, additional friction included.
+        cases: recordings.
+        decimator: filter of the rows.
+        torque_rows: kind of torques in the rows.
+        first: first fit, which gives the weights of the joints.
         prior: prior of the base parameters.
         column_groups: ridge group of each column; -1 for base parameters.
     """
@@ -313,10 +329,10 @@ def _observed(
     settings: IdentificationSettings,
     method: Method,
 ) -> tuple[list[ObservationRows], list[ObservationRows]]:
-    """Return the rows of all cases in the base columns, time blocks numbered: as they are, and standstills marked.
+    """Return the rows of all cases in the base columns with numbered time blocks, without and with marked standstills.
 
     Raises:
-        MeasurementError: for fewer rows than twice the base parameters.
+        MeasurementError: if there are fewer rows than twice the number of base parameters.
     """
     rows = [observe(model, base.kept, case, decimator) for case in cases]
     rows = with_blocks(rows, settings.folds)
@@ -342,7 +358,7 @@ def _identified(
     settings: IdentificationSettings,
     say: Progress,
 ) -> Identification[RegressorModel]:
-    """Return the identification of a problem by a method: estimate, test of its loop, ripple, essential parameters."""
+    """Return the identification of a problem by a method: estimate, simulated loop, ripple, essential parameters."""
     model = problem.model
     base = problem.base
     cases = problem.cases
@@ -385,7 +401,7 @@ def _identified(
 
 
 def chain_states(chain: Chain, model: RegressorModel, seed: int = 0) -> States:
-    """Return random states of a chain's model within the chain's limits."""
+    """Return random states of a chain's model within the chain's joint limits."""
     lower, upper = chain.sampling_limits()
     return bases.random_samples(model, seed=seed, lower=lower, upper=upper)
 
@@ -393,7 +409,14 @@ def chain_states(chain: Chain, model: RegressorModel, seed: int = 0) -> States:
 def find_base(
     model: RegressorModel, cases: Sequence[Case], states: States, nominal: RegressorModel | None = None
 ) -> Base:
-    """Return the base columns of a model, selected over states and payloads on the nominal geometry if one is given."""
+    """Return the base parameters of a model, with columns compared over states and over the payloads of the cases.
+
+    Args:
+        model: the model.
+        cases: recordings.
+        states: states at which columns are compared.
+        nominal: the model on the geometry on which columns are chosen; None: `model`.
+    """
     payloads = [tuple(sorted(case.carried)) for case in cases]
     return bases.find(model, states, tuple(dict.fromkeys(payloads)), nominal=nominal)
 
@@ -406,7 +429,7 @@ def _torque_limits(chain: Chain) -> np.ndarray | None:
 
 
 def _has_drives(model: RegressorModel) -> TypeGuard[IdentificationModel]:
-    """Return whether a model accepts richer friction, which acts on the motors of single joints."""
+    """Return whether a model supports additional friction terms, which act on the motors of single joints."""
     return isinstance(model, IdentificationModel) and model.torque_rows.with_motors
 
 
@@ -421,7 +444,10 @@ def _richer_friction(
     settings: IdentificationSettings,
     progress: Progress | None,
 ) -> tuple[FrictionSelection, Sequence[np.ndarray | None]]:
-    """Return the friction selected on held-out time, and the torques (N, n) that load-dependent terms depend on."""
+    """Return the friction terms selected on held-out time, and for each case the transmitted torques (N, n).
+
+    Load-dependent friction depends on the transmitted torques; these are None if no tested term needs them.
+    """
     loads: list[np.ndarray | None] = [None] * len(cases)
     if not _has_drives(model):
         return FrictionSelection((), (), ()), loads
@@ -456,7 +482,10 @@ def _richer_friction(
 def _with_ripple(
     dynamics: Dynamics[RegressorModel], cases: Sequence[Case], settings: IdentificationSettings, say: Progress
 ) -> tuple[Dynamics[RegressorModel], tuple[Ripple, ...]]:
-    """Return the model with gear ripple identified from its residuals, if the settings request it."""
+    """Return the model with gear ripple identified from its residuals, and the ripple of all joints.
+
+    Without a request in the settings, the model is unchanged and there is no ripple.
+    """
     model = dynamics.model
     if not _has_drives(model) or not model.torque_rows.motors_alone or settings.friction not in ("auto", "ripple"):
         return dynamics, ()
@@ -474,7 +503,7 @@ def _with_ripple(
 def _with_payloads(
     dynamics: Dynamics[RegressorModel], cases: Sequence[Case], settings: IdentificationSettings
 ) -> Dynamics[RegressorModel]:
-    """Return the model with the known parameters of payloads that occur in no training recording."""
+    """Return the model with known parameters set for payloads that are in no training recording."""
     model = dynamics.model
     values = np.array(dynamics.values)
     for label, payload in settings.payloads.items():
@@ -487,11 +516,13 @@ def _with_payloads(
 
 
 def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) -> Decimator:
-    """Return the filter of all rows: the widest of the cases' bands; if that gives too many rows, with every second,
-    third, ... row.
+    """Return the filter and decimation for all cases, with the widest identification band among the cases.
 
-    Too many are more than ``settings.samples``. The band is not reduced: long recordings have redundant rows, but fast
-    motion is only identified in a wide band.
+    If this gives more than ``settings.samples`` rows, only every second, third, … row is used. The band is not reduced:
+    long recordings have redundant rows, but fast motion is identified only in a wide band.
+
+    Raises:
+        MeasurementError: if the sampling rates of the cases differ.
     """
     rates = [case.motion.rate for case in cases]
     message = f"recordings of {min(rates):.4g} Hz and {max(rates):.4g} Hz cannot be combined; resample one of them"
@@ -506,11 +537,11 @@ def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) ->
 
 
 def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> np.ndarray | None:
-    """Return the torque noise (rows,) estimated from repeats of the motion (rms over the cases); None if not requested.
+    """Return the torque noise (rows,) from repetitions of the motion, rms over the cases; None if not requested.
 
     Raises:
-        UsageError: for another method than WLS, or rows with torques that no variance is read for.
-        MeasurementError: for a recording without variances, or with a joint of variance zero.
+        UsageError: for a method other than WLS, or rows other than motor torques.
+        MeasurementError: for a recording without variances, or with a joint of zero variance.
     """
     if settings.weights == "residuals":
         return None
@@ -540,10 +571,10 @@ def _repeats_noise(cases: Sequence[Case], settings: IdentificationSettings) -> n
 
 
 def _takes_prior(method: Method, model: RegressorModel, settings: IdentificationSettings, source: str) -> bool:
-    """Return whether the parameters get a prior: requested, and supported by method and model.
+    """Return whether the parameters get a prior: it is requested, and method and model support it.
 
     Raises:
-        UsageError: where the CAD prior is requested, but the description states no masses.
+        UsageError: if a CAD prior is requested, but the description has no masses.
     """
     if settings.prior == "cad" and source != "cad":
         raise UsageError("prior = 'cad', but the robot's description states no masses")
@@ -551,7 +582,7 @@ def _takes_prior(method: Method, model: RegressorModel, settings: Identification
 
 
 def _essential(fit: MethodEstimate, settings: IdentificationSettings) -> Elimination | None:
-    """Return the elimination of parameters, or None if it is not requested."""
+    """Return the elimination to the essential parameters; None if it is not requested."""
     if settings.essential == "none":
         return None
     data, std, inflation = fit.testable()
@@ -569,13 +600,15 @@ def _require_constrainable(method: Method, settings: IdentificationSettings) -> 
         return
     supporting = [name for name, candidate in METHODS.items() if candidate.takes_constraints]
     constrained = f"pc-{method.name}"
-    advice = f"methods that do: {', '.join(supporting)}"
+    advice = f"methods that support them: {', '.join(supporting)}"
     if constrained in supporting:
         advice = f"use '{constrained}'"
     raise UsageError(f"[constraints]: method '{method.name}' does not support them; {advice}")
 
 
 def _require_motion(cases: Sequence[Case]) -> None:
-    """Raise an error for training cases without motion."""
+    """Raise an error if no joint moves in any of the training cases."""
     if all((np.ptp(case.motion.q, axis=0) < MIN_MOTION).all() for case in cases):
-        refuse_data(cases[0].motion.file, "no joint moves: only gravity in one pose is identifiable")
+        refuse_data(
+            cases[0].motion.file, "no joint moves, so only gravity in one pose is identifiable: record a motion"
+        )

@@ -1,4 +1,4 @@
-"""Charts: lines, boxes and maps drawn in the style of the reports."""
+"""Charts for reports: lines, box plots and maps in a common style."""
 
 from calib.procedure.report.charts import Chart, Layer, Panel, box, line, picture, text
 from calib.procedure.report.geometry_figures import error_histogram, error_map, parameter_changes

@@ -1,4 +1,4 @@
-"""Simulation: virtual cells with known truth, arms in closed loop and their controllers."""
+"""Simulation: virtual cells with known truth, and arms in closed loop with their controllers."""
 
 from calib.identification.closed_loop.controllers import Reference
 from calib.identification.closed_loop.simulation import Plant, Sensing, SimulatedRun, feed_forward, simulate

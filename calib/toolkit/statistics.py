@@ -1,4 +1,4 @@
-"""Estimation on plain arrays: robust weights, relevance of columns, whiteness of residuals."""
+"""Statistics on plain arrays: robust weights, relevance of columns, whiteness of residuals."""
 
 from calib.estimation.estimate import Estimate
 from calib.estimation.relevance import gram, relevance

@@ -1,4 +1,4 @@
-"""Dynamics: regressor models, base parameters, drives, identification methods and their problems."""
+"""Dynamics: regressor models, base parameters, drives, identification problems and methods."""
 
 from calib.dynamics.base import Base, regroup, standard_name
 from calib.dynamics.base import find as find_base

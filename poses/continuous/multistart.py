@@ -12,7 +12,7 @@ from ..space import SearchSpace
 
 
 def random_starts(q: np.ndarray, m: int, count: int, seed: int) -> list[np.ndarray]:
-    """Return `count` random sets (m, n) of the candidates q (N, n); each set has a separate child of the seed."""
+    """Return `count` random sets (m, n) of the candidates q (N, n), each drawn by its own generator."""
     generators = np.random.default_rng(seed).spawn(count)
     return [q[generator.choice(len(q), m, replace=False)] for generator in generators]
 
@@ -31,13 +31,13 @@ def multistart_search(
     """Run the local search from every start and return the best result (ties: the first).
 
     Args:
-        space: limits, constraints, Jacobian; must pickle where `map` runs in other processes.
+        space: limits, constraints, Jacobian; must be picklable where `map` runs in other processes.
         starts: sets (m, n) of poses [rad or m].
         index: the observability index to improve.
         existing: (k, rows, p) Jacobians of poses already measured; None without such poses.
         evaluations: largest number of evaluations per start.
-        seconds: limit of processor time; where it is finite the starts run in this process, one after another, until
-            the time is used up.
+        seconds: limit of processor time [s]; where it is finite the starts run in this process, one after another,
+            until the time is used up.
         map: the builtin, or a parallel map that returns results in order.
         report: called after each start with its number and result; None for no report.
 
@@ -86,7 +86,7 @@ def _one(
 
 
 def _in_time(work: Callable[..., Improved], starts: Sequence[np.ndarray], deadline: float) -> Iterator[Improved]:
-    """Yield the results of the searches that begin before `deadline` [process time, s]; the first start always runs."""
+    """Yield the results of the searches that begin before `deadline` [s of process time]; the first always runs."""
     for number, start in enumerate(starts):
         if number and time.process_time() >= deadline:
             return

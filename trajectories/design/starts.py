@@ -1,6 +1,6 @@
-"""Start motions of searches: random, inside the joint limits, about a pose that breaks the other limits least.
+"""Start motions of searches: random motions inside the joint limits.
 
-Also smaller motions about a pose that keeps the limits, from which a search begins again.
+A search also begins again from smaller motions about a pose inside the limits (`shrunk`).
 """
 
 import numpy as np
@@ -11,11 +11,11 @@ from ..design.problem import ExcitationProblem, stretched
 
 
 def random_start(problem: ExcitationProblem, basis: Basis, rng: np.random.Generator) -> np.ndarray:
-    """Return variables (and the factor on the period, where free) of a random motion within a random part of the joint
-    limits.
+    """Return variables (and the factor on the period, where free) of a random motion inside the joint limits.
 
-    The centre of the motion is the best of 200 random poses by the constraints that a constant pose can break; the
-    amplitude is scaled down to the limits of position, velocity, acceleration and jerk.
+    The motion fills a random part of the joint limits. The centre of the motion is the best of 200 random poses by the
+    constraints that a constant pose can violate. The amplitude is scaled down to the limits of position, velocity,
+    acceleration and jerk.
     """
     n = basis.n
     boxes = [constraint for constraint in problem.constraints if isinstance(constraint, BoxLimit)]
@@ -55,7 +55,7 @@ def random_start(problem: ExcitationProblem, basis: Basis, rng: np.random.Genera
 
 
 def shrunk(problem: ExcitationProblem, y: np.ndarray, share: float) -> np.ndarray:
-    """Return the point of the motion scaled by `share` about its pose furthest inside the limits."""
+    """Return the point of the motion scaled by `share` about its own pose that lies furthest inside the limits."""
     basis = problem.basis()
     path = basis.motion(y[: basis.p])
     still = np.zeros(path.q.shape)
@@ -70,7 +70,7 @@ def shrunk(problem: ExcitationProblem, y: np.ndarray, share: float) -> np.ndarra
 
 
 def _fitting(boxes: list[BoxLimit], still: SampledMotion, moving: SampledMotion) -> float:
-    """Return the largest scale (at most 1) of a motion about the pose `still` that keeps the box limits."""
+    """Return the largest factor (at most 1) by which the motion about the pose `still` satisfies the box limits."""
     share = 1.0
     for box in boxes:
         at = still.orders[box.order]

@@ -1,4 +1,4 @@
-"""Speed along a path: profiles s(t) with s̈ constant between grid points, so that x = ṡ² is linear in s there."""
+"""Speed along a path: profiles s(t) with s̈ constant between grid points, where x = ṡ² is therefore linear in s."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ TorqueLaw = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """A speed profile along a path.
+    """A speed profile along a path: ṡ² at grid points, linear in s between them.
 
     Attributes:
-        s: (K + 1,) grid on the path, rising from 0.
-        x: (K + 1,) ṡ² [1/s² in units of s]; zero at rest.
+        s: (K + 1,) grid of path parameters, rising from 0.
+        x: (K + 1,) ṡ² at the grid points [square of the unit of s, per s²]; zero at rest.
     """
 
     s: np.ndarray
@@ -28,7 +28,7 @@ class Profile:
 
     @property
     def u(self) -> np.ndarray:
-        """Path acceleration s̈ (K,) between grid points: Δx / (2 Δs)."""
+        """Path acceleration s̈ (K,) on each interval: Δx / (2 Δs)."""
         steps = np.diff(self.s)
         return np.diff(self.x) / (2 * steps)
 
@@ -45,7 +45,7 @@ class Profile:
         return float(self.times[-1])
 
     def slower(self, factor: float) -> Profile:
-        """Return the profile `factor` times slower."""
+        """Return the profile slowed down: `factor` times the duration."""
         return Profile(self.s, self.x / factor**2)
 
     def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -69,7 +69,7 @@ class Sampled:
     Attributes:
         s: (N,) path parameters of the samples.
         weights: (N,) duration that each sample represents [s]; they sum to the duration of the motion.
-        q, v, a, tau: (N, n) joint values, velocities, accelerations, torques; tau is None without a torque law.
+        q, v, a, tau: (N, n) joint values, velocities, accelerations, torques; tau is None where no torque law is given.
     """
 
     s: np.ndarray
@@ -81,9 +81,12 @@ class Sampled:
 
 
 def dense(path: Path, profile: Profile, torque: TorqueLaw | None, per_interval: int = 8) -> Sampled:
-    """Return the motion of a profile, sampled on each interval with both ends: s̈ and friction jump between intervals.
+    """Return the motion of a profile, sampled densely on each interval.
 
-    At rest friction takes the direction of the motion that begins or ends there, which gives the larger torque.
+    Both ends of an interval are samples, since s̈ and friction jump between intervals.
+
+    At rest, friction has the direction of the motion that begins or ends at this instant, which gives the larger
+    torque.
     """
     share = np.linspace(1e-6, 1 - 1e-6, per_interval)
     steps = np.diff(profile.s)[:, None]
@@ -113,9 +116,10 @@ def moved(path: Path, s: np.ndarray, speed: np.ndarray, u: np.ndarray) -> tuple[
 
 
 def track(path: Path, profile: Profile, rate: float, torque: TorqueLaw | None = None) -> Setpoints:
-    """Return the motion as setpoints at a controller's rate [Hz]; its duration must be a whole number of samples.
+    """Return the motion as setpoints at a controller's rate [Hz].
 
-    Torques at rest are those just after the start and just before the end.
+    The duration must be a whole number of samples. Torques at rest are those just after the start and just before the
+    end. They are None without a torque law.
     """
     count = round(profile.duration * rate)
     times = np.arange(count + 1) / rate

@@ -1,11 +1,11 @@
-"""The demonstration in one picture: the cell with its errors, their histogram, and the torque of one joint."""
+"""The demonstration in one picture: the cell with its position errors, their histogram, and one joint's torque."""
 
 from dataclasses import replace
 
 import numpy as np
 
 from calib import files
-from calib.apps.cell_demo.summary import PICTURE
+from calib.apps.cell_demo.step_lines import PICTURE
 from calib.toolkit.report_charts import (
     AFTER,
     BEFORE,
@@ -47,7 +47,7 @@ def _seen_from(points: np.ndarray) -> np.ndarray:
 
 
 def _cell(session: Session) -> Panel:
-    """Return the panel of the arm at one of its poses, with the errors at all poses before and after, enlarged."""
+    """Return the panel with the arm at one pose and the enlarged errors at all poses, before and after calibration."""
     chain = chain_of(session)
     (measured,) = drawn(session.folder).measured
     scale = measured.arrow_scale(chain)
@@ -68,7 +68,7 @@ def _cell(session: Session) -> Panel:
 
 
 def _errors(session: Session) -> Panel:
-    """Return the histogram of the errors of nominal robot and robot.urdf at held-out poses."""
+    """Return the histogram of position errors at held-out poses, of the nominal robot and of ``robot.urdf``."""
     sets = read_fit_report(session.validation.report).sets
     (unseen,) = (rows for rows in sets if rows.unseen)
     nominal = np.array(unseen.nominal["position"])
@@ -79,7 +79,7 @@ def _errors(session: Session) -> Panel:
 
 
 def _torque(session: Session) -> Panel:
-    """Return the panel of the largest joint torque on the held-out motion: measured, predicted, residual."""
+    """Return the panel of the joint with the largest torque on the held-out motion: measured, predicted, residual."""
     unseen = session.identification.unseen.read()
     curves = unseen.curves[0]
     t = np.array(curves.t, dtype=float).T

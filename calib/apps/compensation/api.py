@@ -17,17 +17,19 @@ from calib.toolkit.result_folders import GeometryFit, Progress, Shown, joints_of
 
 
 class JointCommands(Shown, joint_commands.Commands):
-    """Joint commands that move the real tool to nominal targets. ``print`` shows which targets are reached and the
-    errors.
+    """Joint commands that move the real tool to nominal targets.
+
+    ``print`` shows which targets are reached, and the errors.
     """
 
     tab = "q reached reason left before sigma expected beyond notes save"
 
     @checked
     def save(self, path: str | Path, *, partial: bool = False, overwrite: bool = False) -> Path:
-        """Write the joint commands as CSV and return its path; with `partial`, also if some targets were not reached.
+        """Write the joint commands as CSV and return its path; with `partial`, also where some targets are not reached.
 
-        A file that no earlier run of calib wrote, or that was changed since, is replaced only with `overwrite`.
+        An existing file that no earlier run of calib wrote, or that was edited since, is replaced only with
+        `overwrite`.
         """
         with files.results([(Path(path), (".csv",))], overwrite=overwrite):
             return joint_commands.write(self, Path(path), partial)
@@ -40,10 +42,10 @@ class JointCommands(Shown, joint_commands.Commands):
 
 
 def read_fitted(folder: str | Path) -> joint_commands.Fitted:
-    """Return the fitted arm with its instrument and tools from a fit's folder.
+    """Return the fitted arm with its instrument placements and tools from a fit's folder.
 
     Raises:
-        UsageError: the folder holds no fit, an incomplete one, or that of a parallel robot.
+        UsageError: the folder has no fit, an incomplete one, or the fit of a parallel robot.
     """
     try:
         return joint_commands.read(folder)

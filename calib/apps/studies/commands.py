@@ -160,7 +160,7 @@ def compare(
 
 
 def _names(text: str | None) -> list[str] | None:
-    """Return the methods of a comma-separated list after a check of their names; None for all."""
+    """Return the methods in a comma-separated list, after a check of their names; None (all methods) for None."""
     from calib.toolkit.torque_models import METHODS
 
     if text is None:

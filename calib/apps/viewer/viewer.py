@@ -1,10 +1,8 @@
 """Display of a scene in Rerun; the only module that loads rerun-sdk, and only when a scene is shown.
 
-Everything is on one timeline, ``time`` [s], in the order of the work: pose plans as they grow, measured poses one by
-one, motions, torques. A pose lasts `EACH`, a motion its own duration. Poses also have timelines of their own.
-
-Everything plays on one clock, the timeline ``time``, in the order of the work: pose plans as they grow, measured poses
-one by one, motions, torques; poses last `EACH`, motions as long as they are. Poses have timelines of their own beside.
+Everything is on one timeline, ``time`` [s], in the order of a calibration: pose plans as they grow, measured poses one
+by one, motions, torques. A pose lasts `EACH` seconds, a motion its own duration. Poses also have timelines of their
+own, which count poses.
 """
 
 from __future__ import annotations
@@ -42,7 +40,7 @@ FILE = "session.rrd"
 
 
 class _Rerun:
-    """The package rerun, loaded at first use."""
+    """The package rerun, loaded when one of its names is first used."""
 
     def __getattr__(self, name: str) -> Any:
         message = "Rerun is not installed here (no version for Macs with Intel processors): pip install rerun-sdk"
@@ -55,7 +53,12 @@ rr = _Rerun()
 
 
 def write(folder: str | Path, path: str | Path, robot: str | None = None) -> Scene:
-    """Write a folder's scene as a Rerun recording, complete or not at all, and return the scene.
+    """Write a folder's scene as a Rerun recording, and return the scene; an incomplete recording is never left.
+
+    Args:
+        folder: folder of a result or a session, or a CSV.
+        path: file of the recording.
+        robot: the robot to draw; None: as the folder has it.
 
     Raises:
         UsageError: rerun is not installed, or the folder has nothing to show.
@@ -74,7 +77,7 @@ def write(folder: str | Path, path: str | Path, robot: str | None = None) -> Sce
 
 
 def write_beside(folder: str | Path) -> str:
-    """Write ``session.rrd`` into a folder if possible, and return its name or why it failed, in one line; never raises.
+    """Write ``session.rrd`` into a folder if possible, and return its name, or in one line why it failed; never raises.
 
     A recording is a convenience: neither a missing package nor a full disk stops the step that writes it.
     """
@@ -87,6 +90,10 @@ def write_beside(folder: str | Path) -> str:
 
 def spawn(folder: str | Path, robot: str | None = None) -> Scene:
     """Open Rerun's window with a folder's scene, and return the scene.
+
+    Args:
+        folder: folder of a result or a session, or a CSV.
+        robot: the robot to draw; None: as the folder has it.
 
     Raises:
         UsageError: there is no display, as over SSH.
@@ -125,7 +132,7 @@ def _send(recording: RecordingStream, scene: Scene) -> None:
 
 
 def about(scene: Scene) -> str:
-    """Return the text shown next to the plots."""
+    """Return the text on a scene that is shown next to the plots."""
     lines = [f"# {scene.title}"]
     for measured in scene.measured:
         nominal_mm = 1e3 * np.linalg.norm(measured.seen - measured.nominal, axis=1)
@@ -157,7 +164,7 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _size_lines(sizes: ErrorSizes) -> Iterator[str]:
-    """Yield lines, for the text beside the plots, on rows without a measured position in the arm's base."""
+    """Yield lines on the errors of measurements that do not give a position in the arm's base."""
     for label, rows in (("fitted", ~sizes.unseen), ("unseen", sizes.unseen)):
         if not rows.any():
             continue
@@ -168,7 +175,7 @@ def _size_lines(sizes: ErrorSizes) -> Iterator[str]:
 
 
 def _rms_mm(sizes: np.ndarray) -> str:
-    """Return the rms of error sizes (m,) [m] as text in mm; NaN are left out, 'not stated' if all are."""
+    """Return the rms of error sizes (m,) [m] as text in mm, ignoring NaN; 'not stated' if all are NaN."""
     errors_mm = 1e3 * sizes[np.isfinite(sizes)]
     if not len(errors_mm):
         return "not stated"
@@ -176,7 +183,14 @@ def _rms_mm(sizes: np.ndarray) -> str:
 
 
 def _poses(name: str, count: int, start: float, selection: np.ndarray | None = None) -> list[TimeColumn]:
-    """Return the time columns of `count` poses, or those selected: the common clock from `start` [s], and a counter."""
+    """Return the time columns of poses: on the common timeline from `start` [s] on, and on a counter called `name`.
+
+    Args:
+        name: name of the counter.
+        count: number of poses.
+        start: time at which the poses begin [s].
+        selection: indices of the poses to include; None for all.
+    """
     steps = np.arange(1, count + 1)
     if selection is not None:
         steps = selection + 1
@@ -184,7 +198,10 @@ def _poses(name: str, count: int, start: float, selection: np.ndarray | None = N
 
 
 def _measured(recording: RecordingStream, scene: Scene, measured: Measured, start: float) -> float:
-    """Log points and error arrows, together and pose by pose; return the start time of the next part [s]."""
+    """Log measured points and error arrows, all together and pose by pose.
+
+    Returns the start time of the next part [s].
+    """
     if not len(measured.q) or scene.chain is None:
         return start
     count = len(measured.q)
@@ -224,7 +241,10 @@ def _measured(recording: RecordingStream, scene: Scene, measured: Measured, star
 
 
 def _sizes(recording: RecordingStream, scene: Scene, sizes: ErrorSizes, start: float) -> float:
-    """Log the sizes of errors row by row, with the arm at each; return the start time of the next part [s]."""
+    """Log the sizes of errors row by row, with the arm at each row's pose.
+
+    Returns the start time of the next part [s].
+    """
     count = len(sizes.q)
     entity = f"errors/{sizes.kind}"
     if sizes.kind == "position":
@@ -245,7 +265,10 @@ def _sizes(recording: RecordingStream, scene: Scene, sizes: ErrorSizes, start: f
 def _chosen(
     recording: RecordingStream, scene: Scene, chain: Chain | Drawn, name: str, q: np.ndarray, start: float
 ) -> float:
-    """Log a pose plan as it grows: one more tool position each step, and the arm at the newest pose."""
+    """Log a pose plan as it grows: one more tool position per step, and the arm at the newest pose.
+
+    Returns the start time of the next part [s].
+    """
     tips = strips(chain, q)[0][:, -1]
     counts = np.arange(1, len(q) + 1)
     positions = np.concatenate([tips[:k] for k in counts])
@@ -259,7 +282,7 @@ def _chosen(
 
 
 def _played(recording: RecordingStream, scene: Scene, played: Played, start: float) -> float:
-    """Log a motion with its limits from `start` on [s], and return the start time of the next part."""
+    """Log a motion and its limits from time `start` [s] on; return the start time of the next part [s]."""
     t = start + played.t - played.t[0]
     samples = thinned(played.t)
     index = [rr.TimeColumn("time", duration=t[samples])]
@@ -277,7 +300,7 @@ def _played(recording: RecordingStream, scene: Scene, played: Played, start: flo
 
 
 def _limits(recording: RecordingStream, joint: Joint, name: str, ends: np.ndarray, velocities: bool) -> None:
-    """Log a joint's limits, where it has any, as lines over a motion's first and last time (2,) [s]."""
+    """Log a joint's limits, if it has any, as lines from the first to the last time of a motion, `ends` (2,) [s]."""
     index = [rr.TimeColumn("time", duration=ends)]
     limits = [("position", "lower", joint.lower), ("position", "upper", joint.upper)]
     if velocities:
@@ -289,7 +312,10 @@ def _limits(recording: RecordingStream, joint: Joint, name: str, ends: np.ndarra
 
 
 def _torques(recording: RecordingStream, scene: Scene, torques: Torques, start: float) -> float:
-    """Log measured torques, predicted torques and residuals, with the arm on the same time axis."""
+    """Log measured torques, predicted torques and residuals, with the arm on the same time axis.
+
+    Returns the start time of the next part [s].
+    """
     t = start + torques.t - torques.t[0]
     index = [rr.TimeColumn("time", duration=t)]
     for j, (name, unit) in enumerate(zip(torques.rows, torques.units)):
@@ -306,7 +332,7 @@ def _torques(recording: RecordingStream, scene: Scene, torques: Torques, start: 
 
 
 def _part(name: str) -> str:
-    """Return a name, escaped as one part of a Rerun entity path."""
+    """Return a name, escaped for use as one part of a Rerun entity path."""
     return rr.escape_entity_path_part(name)
 
 
@@ -318,7 +344,16 @@ def _series(
     name: str,
     colour: Sequence[int] | None = None,
 ) -> None:
-    """Log one line of a plot with its legend."""
+    """Log one curve of a plot with its legend.
+
+    Args:
+        recording: the recording.
+        path: entity path of the curve.
+        index: time columns of the values.
+        values: the values.
+        name: name in the legend.
+        colour: colour of the curve; None: chosen by Rerun.
+    """
     style = {}
     if colour is not None:
         style["colors"] = colour
@@ -328,7 +363,7 @@ def _series(
 
 
 def _arm(recording: RecordingStream, scene: Scene, index: list[TimeColumn], q: np.ndarray) -> None:
-    """Log the arm's links as lines, and its links' frames where it has meshes."""
+    """Log the arm's links as lines, and the frames of the links if the robot has meshes, at joint values q (m, n)."""
     if scene.chain is None or q.shape[1] != scene.chain.n:
         return
     lines = strips(scene.chain, q)
@@ -360,7 +395,7 @@ def _arm(recording: RecordingStream, scene: Scene, index: list[TimeColumn], q: n
 
 
 def _meshes(recording: RecordingStream, scene: Scene) -> None:
-    """Log the meshes, each once, under the frame of its link."""
+    """Log each mesh once, attached to the frame of its link."""
     for number, mesh in enumerate(scene.meshes):
         entity = f"world/robot/links/{_part(mesh.link)}/mesh_{number}"
         position = mesh.placement[:3, 3]
@@ -370,7 +405,7 @@ def _meshes(recording: RecordingStream, scene: Scene) -> None:
 
 
 def _blueprint(scene: Scene) -> Any:
-    """Return the initial layout of the recording: the arm at the left, plots and text at the right."""
+    """Return the initial layout of the recording: the arm on the left, plots and text on the right."""
     import rerun.blueprint as rrb
 
     tabs: list[Any] = []

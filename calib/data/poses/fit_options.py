@@ -160,21 +160,21 @@ class FitOptions(FileOptions):
     source: Annotated[str, Hidden()] = ""
 
     def for_file(self, path: str | Path) -> FileOptions:
-        """Return the options for the file at `path`: its [files] table if present, else the common options."""
+        """Return the options for the file at `path`: its table under [files] if there is one, else the common ones."""
         return own_table(self.files, path) or self
 
 
 def read_options(path: str | Path | None = None) -> FitOptions:
-    """Return the options of the file at `path`; without a file the defaults.
+    """Return the options in the file at `path`; the defaults for None.
 
     Raises:
-        UsageError: for a file that is missing or no TOML, an unknown key, or a value that a key cannot have.
+        UsageError: a file that is missing or not TOML, an unknown key, or an invalid value.
     """
     return FitOptions() if path is None else parse_options(read_toml(path), str(path))
 
 
 def parse_options(table: Mapping[str, object], source: str = "options") -> FitOptions:
-    """Return the options in a parsed TOML table; `source` names the file in messages."""
+    """Return the options in a parsed TOML table; `source` is the file's name in messages."""
     options = parse(FitOptions, inherited(table, FileOptions), source)
     if "free" in table and not options.free:
         refuse_option(source, "free: the list is empty; remove the key to free all parameters")
@@ -185,7 +185,7 @@ def parse_options(table: Mapping[str, object], source: str = "options") -> FitOp
 
 
 def check_files(options: FitOptions, paths: Sequence[str | Path]) -> None:
-    """Refuse a [files] table for a file that is not among `paths`."""
+    """Raise UsageError for a [files] table of a file that is not among `paths`."""
     names = [Path(path).name for path in paths]
     for name in options.files:
         if not any(own_table({name: name}, path) for path in paths):

@@ -69,7 +69,13 @@ from calib.records import FieldValues
 
 
 def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasurements:
-    """Return grouped measurements from the rows of a table, with joint values q (m, n) [rad or m]."""
+    """Return grouped measurements from the rows of a table.
+
+    Args:
+        sheet: the table with its options.
+        layout: the columns to read.
+        q: (m, n) joint values of the rows [rad or m].
+    """
     table, options = sheet.table, sheet.options
     names, group = labels(table, layout.group)
     tool_names, tool = (options.tool,), np.zeros(len(q), dtype=int)
@@ -78,7 +84,10 @@ def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasureme
     notes = ()
     single = [name for name, size in zip(names, np.bincount(group)) if size == 1]
     if single:
-        notes = (f"{layout.kind} {', '.join(single[:5])}: a group of one row determines nothing",)
+        notes = (
+            f"{layout.kind} {', '.join(single[:5])}: measured in one row only, which determines nothing; measure "
+            "more rows",
+        )
     common: FieldValues = {
         "group": group,
         "group_names": names,
@@ -107,7 +116,10 @@ def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasureme
 
 
 def labels(table: Table, columns: Sequence[str]) -> tuple[tuple[str, ...], np.ndarray]:
-    """Return the distinct labels in order of appearance, joined by ``/``, and each row's index (m,) among them."""
+    """Return the distinct labels in order of appearance, and the index (m,) of each row's label.
+
+    The labels of several columns are joined by ``/``.
+    """
     texts = np.column_stack([np.array(table.texts(name), dtype=object) for name in columns])
     empty = (texts == "") | (texts == "nan")
     refuse(table, empty, columns, lambda row, k: "found an empty cell where a label is needed")
@@ -119,7 +131,7 @@ def labels(table: Table, columns: Sequence[str]) -> tuple[tuple[str, ...], np.nd
 
 
 def _read_distance(sheet: Sheet, layout: Layout) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return distances (m,) and their sigmas (m,) [m], None where not stated."""
+    """Return distances (m,) and their sigmas (m,) [m]; sigmas are None if neither columns nor options contain them."""
     distance = sheet.numbers(layout.distance[:1], DISTANCE)[:, 0]
     options = sheet.options.sigma
     if len(layout.distance) == 1 and options.distance is None:
@@ -147,7 +159,7 @@ def _check_pairs(table: Table, layout: Layout, group: np.ndarray, names: Sequenc
 
 
 def _links(sheet: Sheet, layout: Layout, group: np.ndarray) -> tuple[tuple[int, int, float], ...]:
-    """Return the pairs of groups that differ only in the socket's label, with their known distance [m]."""
+    """Return the pairs of groups that differ only in the socket's label, each with the known distance [m]."""
     table, options = sheet.table, sheet.options
     if options.socket_distance is None:
         return ()
@@ -177,12 +189,13 @@ def _links(sheet: Sheet, layout: Layout, group: np.ndarray) -> tuple[tuple[int, 
 
 
 def relative_to_base(block: Positions, position: np.ndarray, quaternion: np.ndarray) -> Positions:
-    """Return measurements expressed in the base frame that was measured with every row.
+    """Return measurements relative to the base frame that was measured with every row.
 
         p = R_bᵀ (p_t - p_b),   R = R_bᵀ R_t
         Σ_p = R_bᵀ (Σ_t + Σ_b + [l]× Σ_rb [l]×ᵀ) R_b,  l = p_t - p_b;   Σ_r = R_bᵀ (Σ_rt + Σ_rb) R_b
 
-    The base is assumed to be measured with the target's sigmas. Only the diagonals of the covariances are kept.
+    Index t denotes the target, b the base frame. The base's sigmas are assumed to be those of the target. Only the
+    diagonals of the covariances are kept.
 
     Args:
         block: positions or poses, in the instrument's frame.
@@ -218,24 +231,25 @@ def _diagonal(sigma: np.ndarray) -> np.ndarray:
 
 
 def _rotated_sigma(rotation: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Return the standard deviations (m, 3) of covariances (m, 3, 3) along rotated axes."""
+    """Return the standard deviations (m, 3) along rotated axes, from covariances (m, 3, 3) and rotations (m, 3, 3)."""
     return np.sqrt(np.einsum("mij,mjk,mik->mi", rotation, covariance, rotation))
 
 
 def read_measurements(
     source: str | Path | Table, joints: Joints | Sequence[str], options: FileOptions | None = None
 ) -> list[PoseMeasurements]:
-    """Return the measurements in a file, or in a table read from one, for a robot with these joints.
+    """Return the measurements in a file, or in a table read from one.
 
     Args:
-        joints: the robot's n joints, or their names alone (then taken as revolute without limits).
-        options: column names, units and kind where the header does not state them.
+        source: the file, or the table.
+        joints: the robot's n joints, or only their names (then taken as revolute without limits).
+        options: column names, units and kind if the header does not contain them; None: the defaults.
 
     Returns:
         A list of one block.
 
     Raises:
-        MeasurementError: for an invalid file or value, with row and column.
+        MeasurementError: an invalid file or value; the message contains row and column.
     """
     robot = Joints.of(joints)
     options = options or FileOptions()
@@ -276,9 +290,9 @@ def read_measurements(
 
 
 def joint_columns(path: str | Path) -> tuple[str, ...]:
-    """Return the header names of `path` that may be joints (without ``q_``): all names unknown to the toolkit.
+    """Return the header names of `path` that may be joints, without ``q_``: all names unknown to the toolkit.
 
-    Callers compare them with the chains of a URDF, to find the chain that was measured.
+    Callers compare them with the joint names of a URDF's chains, to find the chain that was measured.
     """
     toolkit_names = {name + suffix for name in OURS for suffix in SUFFIXES}
     names, units = read_header(path)
@@ -291,7 +305,7 @@ def joint_columns(path: str | Path) -> tuple[str, ...]:
 
 
 def _select_rows(sheet: Sheet) -> Sheet:
-    """Return the sheet with the rows selected by the option ``where``."""
+    """Return the sheet with only those rows that the option ``where`` selects."""
     table = sheet.table
     keep = np.ones(len(table), dtype=bool)
     for name, values in sheet.options.where.items():
@@ -304,7 +318,13 @@ def _select_rows(sheet: Sheet) -> Sheet:
 
 
 def _read_targets(sheet: Sheet, layout: Layout, q: np.ndarray) -> Positions:
-    """Return positions or poses, one row per target seen, in the file's order."""
+    """Return positions or poses, one row per measured target, in the file's order.
+
+    Args:
+        sheet: the table with its options.
+        layout: the columns to read.
+        q: (m, n) joint values of the rows [rad or m].
+    """
     table = sheet.table
     several = len(layout.positions) > 1
     position = np.stack([_position(sheet, columns, several) for columns in layout.positions], axis=1)
@@ -350,13 +370,19 @@ def _position(sheet: Sheet, names: Sequence[str], gaps: bool) -> np.ndarray:
     position = sheet.numbers(names, POSITION, gaps)
     empty = np.isnan(position)
     partial = empty & ~empty.all(axis=1, keepdims=True)
-    message = f"is empty, others of {', '.join(names)} are not: leave all of them empty where a target was not seen"
+    message = f"is empty, unlike others of {', '.join(names)}: leave all of them empty where a target was not seen"
     refuse(sheet.table, partial, names, lambda row, k: message)
     return position
 
 
 def _sigma(sheet: Sheet, layout: Layout, visible: np.ndarray) -> np.ndarray | None:
-    """Return sigmas (m, targets, 3) [m] from the columns, else from the options, else None."""
+    """Return position sigmas (m, targets, 3) [m] from the columns, or from the options; None if neither contains them.
+
+    Args:
+        sheet: the table with its options.
+        layout: the columns to read.
+        visible: (m, targets) whether each target was measured.
+    """
     options = sheet.options.sigma
     if not layout.sigmas:
         if options.position is None:
@@ -368,13 +394,24 @@ def _sigma(sheet: Sheet, layout: Layout, visible: np.ndarray) -> np.ndarray | No
         sigma = sheet.numbers(names, replace(SIGMA, positive=""), gaps=not is_seen.all())
         sigma = np.where(sigma < 0.0, sigma, np.maximum(sigma, options.floor))
         SIGMA.check(np.where(is_seen, sigma, np.nan), sheet.table, names)
-        refuse(sheet.table, np.isnan(sigma) & is_seen, names, lambda row, k: "is empty where a target was seen")
+        refuse(
+            sheet.table,
+            np.isnan(sigma) & is_seen,
+            names,
+            lambda row, k: "is empty where a target was seen: state σ for every row, or remove the column",
+        )
         stack.append(sigma)
     return np.stack(stack, axis=1)
 
 
 def _late(sheet: Sheet, layout: Layout, index: np.ndarray) -> np.ndarray | None:
-    """Return the derivatives (m, 2, 3) of positions by a clock's offset and drift [m/s, m]; None if not stated."""
+    """Return the derivatives (m, 2, 3) of positions by offset [m/s] and drift [m] of a clock; None without the columns.
+
+    Args:
+        sheet: the table with its options.
+        layout: the columns to read.
+        index: (m,) indices of the table's rows.
+    """
     if not layout.late:
         return None
     velocity = sheet.numbers(layout.late[:3], LATE)[index]

@@ -1,6 +1,6 @@
-"""Simulated runs of recordings' closed loops: of the regular robot at the start, and of robots between two estimates.
+"""Simulations of recordings' closed loops: of the initial regular robot, and of robots between two estimates.
 
-The distance of a run from the recorded motion shows how reliable the simulation is.
+The distance of a simulation from the recorded motion shows how reliable the simulation is.
 """
 
 from __future__ import annotations
@@ -31,7 +31,19 @@ Runs = list[tuple[tuple[Case, Loop], SimulatedRun]]
 def regular_plant(
     model: IdentificationModel, terms: Sequence[DriveTerm], loop: Loop, inertia: np.ndarray | None
 ) -> Plant:
-    """Return the robot of the first simulation: joint inertias J (its last n parameters), no bodies, no gravity."""
+    """Return the robot of the first simulation: joint inertias J only, without bodies and gravity.
+
+    J are its last n parameters.
+
+    Args:
+        model: model of the robot.
+        terms: additional friction terms, with values of zero.
+        loop: loop of the first recording.
+        inertia: J (n,) [kg m²]; None: kd² / (2 kp) of the loop's controller.
+
+    Raises:
+        UsageError: if the controller's gains give no positive inertia.
+    """
     if inertia is None:
         with np.errstate(divide="ignore", invalid="ignore"):
             inertia = loop.controller.kd**2 / (2.0 * loop.controller.kp)
@@ -43,7 +55,7 @@ def regular_plant(
 
 
 def simulated_runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
-    """Return the noise-free simulation of every recording's loop."""
+    """Return noise-free simulations of the loops of all recordings."""
     result: Runs = []
     for case, loop in cases:
         robot = plant.carrying(case.carried)
@@ -56,15 +68,17 @@ def simulated_runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
 
 
 def between(start: Plant, end: Plant, share: float) -> Plant:
-    """Return the plant whose parameters are a share of the way from one plant to another."""
+    """Return the robot with parameters (1 - share) · start + share · end."""
     return end.with_parameters(share * end.parameters + (1.0 - share) * start.parameters)
 
 
 def nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tuple[Plant, Runs]:
-    """Return the plant halfway from `start` to `end`, or nearer to `start` if it cannot be simulated, and its runs.
+    """Return a robot between `start` and `end` that can be simulated, with its simulations.
+
+    The robot is halfway, or nearer to `start` if that robot cannot be simulated.
 
     Raises:
-        CannotSimulate: where no plant near `start` can be simulated.
+        CannotSimulate: if no robot near `start` can be simulated.
     """
     problem: CalibError | None = None
     for halvings in range(1, MAX_RETREATS + 1):
@@ -73,11 +87,11 @@ def nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tupl
             return candidate, simulated_runs(candidate, cases)
         except CalibError as error:
             problem = error
-    raise CannotSimulate(f"no robot on the way to the estimate can be simulated: {problem}", start)
+    raise CannotSimulate(f"no parameters between the start and the estimate can be simulated: {problem}", start)
 
 
 def distance_percent(runs: Runs) -> np.ndarray:
-    """Return the position difference of simulated and recorded robot (n,), relative to the travel [%]."""
+    """Return the rms difference of simulated and recorded positions (n,), relative to the motion's rms [%]."""
     n = runs[0][0][0].motion.n
     away, size = np.zeros((2, n))
     for (case, loop), run in runs:
@@ -90,7 +104,7 @@ def distance_percent(runs: Runs) -> np.ndarray:
 
 
 def error_ratio(runs: Runs) -> np.ndarray:
-    """Return the ratios (n,) of recorded to simulated tracking errors, by regression; NaN where noise hides them."""
+    """Return the ratios (n,) of recorded to simulated tracking errors, by regression; NaN if noise hides the ratio."""
     measured_errors = []
     expected_errors = []
     for (case, loop), run in runs:

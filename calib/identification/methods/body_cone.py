@@ -1,11 +1,11 @@
 """Base parameters of physically consistent bodies, i.e. of standard parameters with pseudo-inertias P_i >= 0.
 
-    { β : β = T χ,  P_i(χ) ⪰ 0,  drives' terms >= 0 }       unidentified parts of χ are free
+    { β : β = T χ,  P_i(χ) ⪰ 0,  drive terms >= 0 }       unidentified parts of χ are free
 
-(Sousa & Cortesão 2014, with the pseudo-inertia of Wensing, Kim & Slotine 2018). Where the unconstrained optimum is
-outside this convex cone, the optimum on the cone is found by a semidefinite program (Clarabel), and the cone is
-replaced by its tangent plane at the optimum, νᵀ β >= νᵀ β*. This gives the same optimum with one multiplier, and a
-covariance that treats the plane as an equality (our choice; the cone is curved).
+(Sousa & Cortesão 2014, with the pseudo-inertia of Wensing, Kim & Slotine 2018). If the unconstrained optimum is outside
+this convex cone, a semidefinite program (Clarabel) finds the optimum in the cone, and the cone is replaced by its
+tangent plane at this optimum β*, νᵀ β >= νᵀ β*. This gives the same optimum with one multiplier, and a covariance that
+treats the plane as an equality (our choice; the cone is curved).
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,13 @@ from calib.records import Frozen
 
 @dataclass(frozen=True, eq=False)
 class _Plane:
-    """Tangent plane of the cone at an optimum β*: normal ν (p,), bound νᵀ β*, labels of the bodies on the border."""
+    """Tangent plane νᵀ β >= νᵀ β* of the cone at an optimum β*.
+
+    Attributes:
+        normal: (p,) ν.
+        bound: νᵀ β*.
+        bodies: labels of the bodies at the limit of physical consistency.
+    """
 
     normal: np.ndarray
     bound: float
@@ -31,12 +37,12 @@ class _Plane:
 
 @dataclass(frozen=True, eq=False)
 class BodyCone(Frozen):
-    """Convex cone of all base parameters that belong to physically consistent bodies and drives.
+    """Convex cone of the base parameters of all physically consistent bodies and drives.
 
     Attributes:
-        transform: T (b, P) of the standard parameters, ten by body, then the drives' terms.
+        transform: T (b, P), from the standard parameters (ten per body, then the drive terms) to base parameters.
         labels: names of the bodies.
-        positive: (P - 10 B,) which drive terms must not be negative.
+        positive: (P - 10 B,) whether each drive term must not be negative.
     """
 
     transform: np.ndarray
@@ -44,13 +50,17 @@ class BodyCone(Frozen):
     positive: np.ndarray
 
     def touching(self, factor: np.ndarray, matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> _Plane | None:
-        """Return the cone's tangent plane at argmin ½ ‖R β - z‖², lower <= A β <= upper; None if the cone is inactive.
+        """Return the cone's tangent plane at argmin ½ ‖R β - z‖² under lower <= A β <= upper and the cone.
+
+        The result is None if the cone is not binding.
 
         Args:
-            factor: (p + 1, p + 1) triangle [R z; 0 ρ]; base columns first.
+            factor: (p + 1, p + 1) upper triangle [R z; 0 ρ]; base columns first.
+            matrix: A (c, p).
+            lower, upper: (c,) bounds, -inf and inf allowed.
 
         Raises:
-            NotConverged: where no bodies satisfy the bounds.
+            NotConverged: if no bodies satisfy the bounds.
         """
         p = len(factor) - 1
         count = len(self.labels)
@@ -108,7 +118,7 @@ class BodyCone(Frozen):
 
 
 def cone_of(model: RegressorModel, base: Base) -> BodyCone:
-    """Return the cone of consistent base parameters of a model."""
+    """Return the cone of physically consistent base parameters of a model."""
     labels = tuple(name.removeprefix("XX") for name in model.names[: model.inertial : 10])
     positive = [column.nonnegative for column in model.columns]
     return BodyCone(np.asarray(base.transform), labels, np.array(positive, dtype=bool))

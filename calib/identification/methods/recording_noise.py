@@ -28,7 +28,6 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.estimation.robust import variance_weights
-from calib.estimation.triangles import Triangles
 from calib.estimation.whiteness import inflation
 from calib.identification.rows import ObservationRows, pool, triangulate
 from calib.identification.time_folds import covariance_root, estimate
@@ -102,24 +101,24 @@ def _error_size(errors: np.ndarray, parameters: float) -> tuple[float, float]:
 
 
 def drawn_together(sizes: ErrorSizes) -> np.ndarray:
-    """Return the logarithms (recordings, rows) moved towards each row's mean as far as their variances ask, minus it.
+    """Return the deviations (recordings, rows) of the logarithms from each row's mean, as far as they are significant.
 
-    Zero where nothing is known.
+    They are zero where recordings do not differ, and where a size is unknown.
     """
+    finite = np.isfinite(sizes.variances)
     weight = 1.0 / sizes.variances
     total = np.maximum(weight.sum(axis=0), 1e-300)
     mean = (weight * sizes.logs).sum(axis=0) / total
-    finite = np.isfinite(sizes.variances)
-    freedom = np.maximum(finite.sum(axis=0) - 1, 0).sum()
-    excess = float(np.sum(weight * (sizes.logs - mean) ** 2)) - freedom
+    excess = float(np.sum(weight * (sizes.logs - mean) ** 2))
+    excess -= float(np.maximum(finite.sum(axis=0) - 1, 0).sum())
     scale = float(np.sum(total - (weight**2).sum(axis=0) / total))
-    between = max(excess, 0.0) / max(scale, 1e-300)
-    if not between > 0.0:
+    if excess <= 0.0 or scale <= 0.0:
         return np.zeros(sizes.logs.shape)
-    weight = np.where(finite, 1.0 / (between + sizes.variances), 0.0)
-    mean = (weight * sizes.logs).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300)
-    share = np.where(finite, between / (between + sizes.variances), 0.0)
-    return np.where(finite, share * (sizes.logs - mean), 0.0)
+    between = excess / scale
+    weight = 1.0 / (between + sizes.variances)
+    total = np.maximum(weight.sum(axis=0), 1e-300)
+    mean = (weight * sizes.logs).sum(axis=0) / total
+    return np.where(finite, between * weight * (sizes.logs - mean), 0.0)
 
 
 def with_precision(
@@ -129,7 +128,7 @@ def with_precision(
     groups: np.ndarray | None = None,
     prior: np.ndarray | None = None,
 ) -> list[ObservationRows]:
-    """Return rows weighed by their recording's errors; as they are where these do not differ.
+    """Return rows weighted by the errors of their recordings; equal weights where these do not differ.
 
     Args:
         all_rows: rows by recording.
@@ -137,33 +136,42 @@ def with_precision(
         groups: (p,) ridge group of each column, -1 for none; None: no ridges.
         prior: (k, p + 1) whitened rows of [W y] of a prior; None without one.
     """
-    result = list(all_rows)
-    if len(result) == 1:
-        return result
+    if len(all_rows) == 1:
+        return list(all_rows)
     row_count = len(std)
+    equal = np.ones(row_count)
+    parts = [pool(triangulate([replace(rows, precision=equal)]), row_count) for rows in all_rows]
+    counts = np.array([part.rows for part in parts], dtype=float)
+    if groups is None:
+        groups = np.full(parts[0].parameters, -1)
     noise = std * np.sqrt(inflations)
-    counts = np.array([part.present.sum(axis=0) for part in result], dtype=float)
-    total = np.maximum(counts.sum(axis=0), 1.0)
+    precision = np.ones((len(parts), row_count))
     for _ in range(ROUNDS):
-        parts = [pool(triangulate([part]), row_count) for part in result]
-        factors = np.concatenate([part.factors for part in parts], axis=1)
-        joined = replace(parts[0], factors=factors, rows=np.sum([part.rows for part in parts], axis=0))
-        if groups is None:
-            groups = np.full(joined.parameters, -1)
+        factors = np.stack([part.factors for part in parts], axis=1) * precision.T[:, :, None, None]
+        size = factors.shape[-1]
+        joined = replace(parts[0], factors=factors.reshape(row_count, -1, size), rows=counts.sum(axis=0))
         values, ridges = estimate(joined, std, inflations, groups, prior)
         root = covariance_root(joined, std, inflations, ridges, prior)
-        parameters = np.array([_parameter_counts(part, root, noise) for part in parts])
-        logs = drawn_together(error_sizes(result, values, parameters))
-        # One σ stands for all: its square is the mean of theirs.
-        common = np.log(np.sum(counts * np.exp(logs), axis=0) / total)
-        result = [replace(part, precision=frozen(np.exp(0.5 * (common - log)))) for part, log in zip(all_rows, logs)]
+        explained = factors[:, :, :, :-1] @ root
+        parameters = np.sum(explained**2, axis=(2, 3)).T / noise**2
+        precision = _precision(drawn_together(error_sizes(all_rows, values, parameters)), counts)
+    result = []
+    for rows, factor in zip(all_rows, precision):
+        result.append(replace(rows, precision=frozen(factor)))
     return result
 
 
-def _parameter_counts(data: Triangles, root: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """Return how many parameters the rows of each group determine (rows,), tr(W C Wᵀ) / noise²."""
-    explained = data.factors[:, :, :-1] @ root
-    return np.sum(explained**2, axis=(1, 2)) / noise**2
+def _precision(logs: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Return the factors of the rows (recordings, rows): √(mean variance / variance), the mean over all rows.
+
+    Args:
+        logs: (recordings, rows) logarithms of the variances.
+        counts: (recordings, rows) number of rows.
+    """
+    variances = np.exp(logs)
+    total = np.maximum(counts.sum(axis=0), 1.0)
+    mean = np.maximum((counts * variances).sum(axis=0) / total, 1e-300)
+    return np.where(counts.sum(axis=0) > 0.0, np.sqrt(mean / variances), 1.0)
 
 
 def error_growth(all_rows: Sequence[ObservationRows], values: np.ndarray) -> ErrorGrowth:

@@ -1,19 +1,21 @@
-"""Output and input error of the simulated closed loop: the survey's CLOE and CLIE, with exact sensitivities.
+"""Output and input error of the simulated closed loop: the survey's CLOE and CLIE, with exact derivatives.
 
-    CLOE    min Σ_k ‖q_k - q_s,k(χ)‖²        the robot that moves as the real one does
-    CLIE    min Σ_k ‖tau_k - tau_s,k(χ)‖²    the robot whose controller asks for the same torques
+    CLOE    min Σ_k ‖q_k - q_s,k(χ)‖²        the simulated robot moves as the real one
+    CLIE    min Σ_k ‖tau_k - tau_s,k(χ)‖²    the simulated robot's controller requires the recorded torques
 
-With joint torque sensors (rows link, both) both compare their torques too, which are an output of the loop: simulated
-ones are those of the bodies and the link side along the simulated motion, filtered like the recorded one (our choice).
+q_s and tau_s are those of the loop simulated without noise (Leboutet et al. 2021, sections 5.1 and 5.2, after Landau
+1979; Gautier, Janot & Vandanjon 2013), and each joint is weighted by its residuals. With joint torque sensors (rows
+link, both) both methods also compare the sensors' torques, which are outputs of the loop: simulated torques are those
+of the bodies and the link side along the simulated motion, filtered like the recorded motion (our choice).
 
-q_s and tau_s of the loop simulated without noise (Leboutet et al. 2021, sections 5.1 and 5.2, after Landau 1979;
-Gautier, Janot & Vandanjon 2013), each joint weighted by its residuals. Damped Gauss–Newton steps need ∂q_s/∂χ and
-∂tau_s/∂χ: here the tangents of the simulation itself in one pass (`tangent_kernels`) where differences take one
-simulation per parameter, as they do for parallel robots. Torques of redundant actuators are compared on the platform's
-coordinates, as least squares takes them. The residuals are the effect of noise in the loop, correlated over time; the
-covariance H⁻¹ S H⁻¹ accounts for this, with S the scatter of the scores (`score_covariance`).
+Damped Gauss–Newton steps need ∂q_s/∂χ and ∂tau_s/∂χ. Here these are the tangents of the simulation, computed in one
+pass (`tangent_kernels`); differences, which parallel robots use, need one simulation per parameter. Torques of
+redundant actuators are compared in the platform's coordinates, as in least squares. The residuals are the effect of
+noise in the loop and autocorrelated; the covariance H⁻¹ S H⁻¹ accounts for this, with S the covariance of the gradient
+(`score_covariance`).
 
-What slides call CLIE, (ZᵀZ)⁻¹Zᵀy with Z the simulated observation matrix, is the survey's DIDIM; so it is here.
+The method that some slides call CLIE, (ZᵀZ)⁻¹Zᵀy with Z the simulated observation matrix, is DIDIM in the survey and
+here.
 """
 
 from dataclasses import dataclass, field, replace
@@ -60,17 +62,17 @@ class _OutputError(Method):
     torques: bool
 
     def takes(self, rows: TorqueRows) -> bool:
-        """Return whether it estimates from these torque rows.
+        """Return whether the method supports these torque rows.
 
-        For CLIE sensors' torques alone do not suffice, since they do not identify the motors' motion.
+        CLIE does not support sensor torques alone, since these do not identify the motion of the motors.
         """
         return super().takes(rows) and (not rows.sensed or rows.with_motors or not self.torques)
 
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
-        """Return the estimate of the problem's parameters; one simulation gives motion and Jacobian.
+        """Return the estimate of the problem's parameters.
 
         Raises:
-            UsageError, MeasurementError: for a loop or recordings that no simulation can start from.
+            UsageError, MeasurementError: for a loop or recordings that cannot be simulated.
         """
         if problem.loop is None:
             raise UsageError(f"method '{self.name}' needs a [loop], and a robot that can be simulated")
@@ -111,7 +113,9 @@ class _OutputError(Method):
         fit = _packed(task, plain, values, residual, slopes, std)
         step = np.linalg.norm(_gradient(residual / std, slopes / std[:, None]))
         if not solution.status.good and step > 0.5:
-            raise NotConverged(f"{self.name}: {solution.status.value} ({step:.2g} standard deviations from rest)", fit)
+            raise NotConverged(
+                f"{self.name}: {solution.status.value} ({step:.2g} standard deviations in the last step)", fit
+            )
         simulations = task.count[0]
         return replace(
             plain,
@@ -128,9 +132,17 @@ class _OutputError(Method):
 
 @dataclass(frozen=True, eq=False)
 class _Comparison:
-    """Signals to compare, positions or torques of the recordings' control loops; `count` counts the simulations.
+    """Comparison of simulated with recorded signals of all closed loops.
 
-    Rows (M, r) are those of the torque sensors, if the problem has any, then r = n of the positions or motor torques.
+    Residuals and Jacobians have r columns: first the torque sensors, if the problem has any, then n positions or motor
+    torques.
+
+    Attributes:
+        problem: data and settings.
+        robot: the simulated robot.
+        loops: closed loops of the recordings.
+        torques: whether motor torques are compared instead of positions.
+        count: number of simulations so far, in a list of one entry.
     """
 
     problem: IdentificationProblem
@@ -141,15 +153,17 @@ class _Comparison:
 
     @property
     def rows(self) -> TorqueRows:
-        """Kind of the problem's torque rows."""
+        """Torque rows of the problem's model."""
         return self.problem.model.torque_rows
 
     def whole(self, values: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-        """Return the parameters (p + k,) of the simulated robot: the problem's and, without motor torques, its motors'.
+        """Return the parameters (p + k,) of the simulated robot.
+
+        They are the problem's parameters and, if the problem has no motor torques, k parameters of the motors.
 
         Args:
-            values: (p,) of the problem.
-            inertia: (n,) that the motors start with [kg m² or kg]; they start without friction.
+            values: (p,) parameters of the problem.
+            inertia: (n,) first inertias of the motors [kg m² or kg]; their first friction is zero.
         """
         motors = np.zeros(len(self.robot.columns) - len(values))
         stride = max(1, len(motors) // len(inertia))
@@ -157,7 +171,11 @@ class _Comparison:
         return np.append(values, motors)
 
     def simulated(self, values: np.ndarray) -> None:
-        """Simulate all loops with the parameters (p,); raise if that fails."""
+        """Simulate all loops with parameters (p,), to check that this is possible.
+
+        Raises:
+            CalibError: if a loop cannot be simulated.
+        """
         for case, loop in self.loops.pairs:
             plant = self.robot.at(values, case)
             controller = loop.controller
@@ -168,7 +186,7 @@ class _Comparison:
             plant.run(controller, loop.reference, Sensing(every=loop.every))
 
     def linearised(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals (M, r), zero at samples not compared, and the Jacobian (M, r, p) of simulated signals."""
+        """Return residuals (M, r), zero if not in use, and the Jacobian (M, r, p) of the simulated signals."""
         residuals = []
         slopes = []
         for case, loop in self.loops.pairs:
@@ -213,7 +231,14 @@ class _Comparison:
         return np.concatenate(residuals), np.concatenate(slopes)
 
     def _sensed(self, plant: Plant, case: Case, run: Sensitivities, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals (N, n) of the sensors' torques [N m or N], and the Jacobian (N, n, p) of simulated ones."""
+        """Return residuals (N, n) of the sensors' torques [N m or N], and the Jacobian (N, n, p) of simulated torques.
+
+        Args:
+            plant: the simulated robot.
+            case: the recording.
+            run: simulated motion with its derivatives.
+            index: (N,) indices of the simulated samples at the recorded times.
+        """
         link = IdentificationModel(plant.bodies, plant.terms, LINK)
         link_columns = list(range(plant.inertial))
         link_columns += [column for column, term in enumerate(plant.terms, plant.inertial) if term in link.columns]
@@ -232,13 +257,19 @@ class _Comparison:
         return case.target[:, : case.motion.n] - regressor @ values, jacobian
 
     def _inertia_slopes(self, q: np.ndarray) -> np.ndarray:
-        """Return the Jacobian (n, p) of the mean diagonal of the inertia matrix with respect to the parameters."""
+        """Return the derivatives (n, p) of the inertia matrix's diagonal by the parameters.
+
+        The diagonal is the mean over joint positions q (N, n).
+        """
         units = np.eye(len(self.robot.columns))
         diagonals = [self.robot.at(unit).inertia_diagonal(q) for unit in units]
         return np.array(diagonals).T
 
     def whitened(self, values: np.ndarray, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals (M r,) and Jacobian (M r, p) divided by std (r,); huge residuals if the simulation fails."""
+        """Return residuals (M r,) and Jacobian (M r, p), divided by std (r,).
+
+        If the simulation fails, the residuals are huge and the Jacobian is zero.
+        """
         p = len(values)
         # residual of parameters that cannot be simulated: any step that can is better
         impossible = 1e60
@@ -250,7 +281,7 @@ class _Comparison:
         return (residual / std).ravel(), np.asfortranarray(scaled_slopes)
 
     def solved(self, values: np.ndarray, std: np.ndarray) -> nonlinear.Solution[np.ndarray]:
-        """Return the parameters that minimise the residuals divided by std (r,)."""
+        """Return the parameters that minimise the residuals divided by std (r,), with convergence."""
         # at first
         first_damping = 1e-3
         # simulations with tangents per round
@@ -269,7 +300,7 @@ class _Comparison:
         )
 
     def spread(self, residual: np.ndarray, p: int) -> np.ndarray:
-        """Return the standard deviation (r,) of each row's residuals."""
+        """Return the standard deviation (r,) of each column of residuals (M, r), after a fit of p parameters."""
         count = np.maximum(np.sum(residual != 0.0, axis=0), 1)
         share = max(1.0 - p / count.sum(), 0.1)
         std = np.sqrt(np.sum(residual**2, axis=0) / count / share)
@@ -284,7 +315,7 @@ class _Comparison:
 
 
 def _gradient(residual: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Return the next Gauss–Newton step Qᵀ r (p,), in standard deviations of white residuals."""
+    """Return the next Gauss–Newton step Qᵀ r (p,), in standard deviations of the estimate for white residuals."""
     p = slopes.shape[2]
     flat = slopes.reshape(-1, p)
     orthonormal, _ = np.linalg.qr(flat)
@@ -299,10 +330,17 @@ def _packed(
     slopes: np.ndarray,
     std: np.ndarray,
 ) -> LinearFit:
-    """Return the fit for parameters, residuals and Jacobian, with the covariance H⁻¹ S H⁻¹.
+    """Return the fit of parameters, residuals and Jacobian, with the covariance H⁻¹ S H⁻¹.
+
+    Args:
+        task: the comparison.
+        plain: the least-squares estimate, for names and units.
+        values: (p,) parameters.
+        residual, slopes: (M, r) residuals and (M, r, p) Jacobian.
+        std: (r,) standard deviations.
 
     Raises:
-        Unidentifiable: where the simulated motion does not distinguish parameters.
+        Unidentifiable: if the simulated motion does not distinguish parameters.
     """
     white = slopes / std[:, None]
     white_residual = residual / std

@@ -1,25 +1,25 @@
 """Compiled derivatives of the closed loop (numba): a simulated motion's Jacobian with respect to parameters.
 
-The exact derivative of what `loop_kernels` computes, step by step. With K = ∂tau/∂q, D = ∂tau/∂v and Y = ∂tau/∂χ of the
-inverse dynamics at a state and its accelerations,
+The kernels compute the exact derivative of the results of `loop_kernels`, step by step. With K = ∂tau/∂q, D = ∂tau/∂v
+and Y = ∂tau/∂χ of the inverse dynamics at a state and its accelerations,
 
     M δa = δtau - K δq - D δv - Y,
 
-c columns at a time, through the stages of Runge and Kutta, the controller and its memory. K and D come from composite
-quantities about the base's origin: with ψ̇_i = V_p × S_i and ψ̈_i = A_p × S_i + V_p × ψ̇_i,
+for c columns at a time, through the stages of the Runge-Kutta method, the controller and its memory. K and D follow
+from composite quantities about the base's origin: with ψ̇_i = V_p × S_i and ψ̈_i = A_p × S_i + V_p × ψ̇_i,
 
     K_ji = S_jᵀ (2 B_i ψ̇_i + I_i ψ̈_i + S_i ×* f_i),   K_ij = S_iᵀ (2 B_i ψ̇_j + I_i ψ̈_j),
-    D_ji = S_jᵀ (2 B_i S_i + 2 I_i ψ̇_i),               D_ij = S_iᵀ (2 B_i S_j + 2 I_i ψ̇_j),   j on the way to i
+    D_ji = S_jᵀ (2 B_i S_i + 2 I_i ψ̇_i),               D_ij = S_iᵀ (2 B_i S_j + 2 I_i ψ̇_j),   j between base and i
 
-(Singh, Russell & Wensing 2022, one degree of freedom per joint). About one origin 2 B m = [2 P w; 2 w × L] for a twist
-m with angular part w: P = -[ω]Σ - [h][ν] and L = m ν + ω × h add up along the tree as the inertias do.
+(Singh, Russell & Wensing 2022, one degree of freedom per joint). About a common origin 2 B m = [2 P w; 2 w × L] for a
+twist m with angular part w: P = -[ω]Σ - [h][ν] and L = m ν + ω × h add up along the tree as the inertias do.
 
-Arrays are those of `loop_kernels`; besides
+Arrays are those of `loop_kernels`, and
 
-    find     (p,): column of each parameter among the c, or -1
-    order, entries, shares, owners: see `loop_kernels.set_parameters`
-    more     (B + 1, 36): acceleration, ψ̇, ψ̈, wrench, P 24 … 32, L 33 … 35
-    own      (B, 10): inertia of each body alone
+    find      (p,): column of each parameter among the c columns, or -1
+    order, entries, shares, owners: index arrays of `loop_kernels.set_parameters`
+    extended  (B + 1, 36): acceleration, ψ̇, ψ̈, wrench, P in columns 24 … 32, L in columns 33 … 35
+    bodies_own  (B, 10): inertia of each body alone
 """
 
 import numpy as np
@@ -49,7 +49,10 @@ from calib.identification.closed_loop.loop_kernels import (
 
 @njit(**OPTIONS)
 def _outward(tree, body, v, a, work, bodies_own, extended):
-    """Write accelerations, ψ̇ and ψ̈, and each body's inertia, wrench, P and L; `work` is that of `dynamics`."""
+    """Write accelerations, ψ̇ and ψ̈, wrench, P and L of each body into `extended`, and its inertia into `bodies_own`.
+
+    `work` must contain the results of `dynamics`.
+    """
     count = tree.shape[0]
     for i in range(count):
         for r in range(10):
@@ -93,7 +96,10 @@ def _outward(tree, body, v, a, work, bodies_own, extended):
 
 @njit(**OPTIONS)
 def _slopes(tree, work, extended, by_q, by_v):
-    """Add the bodies' part of K and D (n, n), summing composite quantities from the tips to the base."""
+    """Add the bodies' part of K and D (n, n) to `by_q` and `by_v`.
+
+    Composite quantities are summed from the tips to the base.
+    """
     count = tree.shape[0]
     for i in range(count - 1, -1, -1):
         p, c = tree[i, 0], tree[i, 2]
@@ -129,7 +135,7 @@ def _slopes(tree, work, extended, by_q, by_v):
 
 @njit(**OPTIONS)
 def _columns(tree, order, find, work, extended, out):
-    """Add the derivatives Y (n, c) with respect to the bodies' parameters that have a column."""
+    """Add the derivatives Y (n, c) by the bodies' parameters to `out`, for parameters that have a column."""
     count = tree.shape[0]
     for i in range(count):
         has_column = False
@@ -179,7 +185,10 @@ def _linearise(
     by_v,
     out,
 ):
-    """Write K, D (n, n) and Y (n, c) of the inverse dynamics at q, v, a; `work` is that of `dynamics`."""
+    """Write K, D (n, n) and Y (n, c) of the inverse dynamics at q, v, a into `by_q`, `by_v` and `out`.
+
+    `work` must contain the results of `dynamics`.
+    """
     n = q.shape[0]
     by_q[:] = 0.0
     out[:] = 0.0
@@ -208,7 +217,7 @@ def _linearise(
 
 @njit(**OPTIONS)
 def _solve(matrix, by_q, by_v, columns, dq, dv, dtau, out):
-    """Write M⁻¹ (δtau - K δq - D δv - Y) into out (n, c); M is given factorised."""
+    """Write M⁻¹ (δtau - K δq - D δv - Y) into out (n, c); `matrix` contains the factors of M."""
     n, c = out.shape
     for j in range(n):
         for m in range(c):
@@ -235,7 +244,10 @@ def _solve(matrix, by_q, by_v, columns, dq, dv, dtau, out):
 def _advance_tangent(
     plant, layout, memory, loads, q, v, dq, dv, tau, dtau, period, slopes, dslopes, work, matrix, rooms
 ):
-    """Advance q, v (n,) and δq, δv (n, c) by one period as `loop_kernels.advance` does; `slopes[0]` is not used."""
+    """Advance q, v (n,) and δq, δv (n, c) by one period, as `loop_kernels._advance` advances q, v; return a status.
+
+    `slopes[0]` need not contain the accelerations at the start.
+    """
     tree, body, linear, kinds, acts = plant
     bodies_own, extended, by_q, by_v, columns, at, rate, dat, drate = rooms
     n, c = dq.shape
@@ -286,7 +298,7 @@ def _advance_tangent(
 
 @njit(**OPTIONS)
 def _workspace(bodies, n, c):
-    """Return the work arrays of `_advance_tangent`."""
+    """Return the working arrays of `_advance_tangent` for a number of bodies, n joints and c columns."""
     bodies_own, extended = np.empty((bodies, 10)), np.empty((bodies + 1, 36))
     square, wide = (np.empty((n, n)), np.empty((n, n))), np.empty((n, c))
     return (
@@ -304,10 +316,10 @@ def _workspace(bodies, n, c):
 
 @njit(**OPTIONS)
 def advance_linearised(plant, layout, values, q, v, tau, period, gain, dq, dv):
-    """Advance a state q, v (n,) by a period under one torque (n,); write its Jacobian into dq and dv.
+    """Advance a state q, v (n,) by one period under a constant torque (n,), and write its Jacobian; return a status.
 
-    dq, dv (n, 2 n + c): slopes by q, v and the c parameters of `layout`, whose columns start at 2 n. Writes M⁻¹ into
-    gain (n, n); returns a status.
+    dq, dv (n, 2 n + c): derivatives of the new state by q, v and the c parameters of `layout`, whose columns start at 2
+    n. M⁻¹ is written into gain (n, n).
     """
     tree, body, linear, kinds, acts = plant
     order, entries, shares, owners, _ = layout
@@ -354,7 +366,10 @@ def _command_tangent(
     matrix,
     rooms,
 ):
-    """Write the derivatives (n, c) of the command before saturation; feedback (n,) is its feedback part."""
+    """Write the derivatives (n, c) of the command before saturation into `dwish`.
+
+    feedback (n,) is the feedback part of the command.
+    """
     bodies_own, extended, by_q, by_v, columns, at, _, dat, _ = rooms
     tree, linear = plant[0], plant[2]
     n = len(dwish)
@@ -384,10 +399,11 @@ def _command_tangent(
 def closed_loop_tangent(
     plant, layout, model, gains, relative, reference, period, smoothing, late, every, q, v, count, out, dout
 ):
-    """Write the noise-free motion of `loop_kernels.closed_loop` with its tangents. Return (status, period reached).
+    """Write the noise-free motion of `loop_kernels.closed_loop` and its tangents; return a status and a period.
 
-    relative (n, c): slopes of the gains' common factor, joint by joint, over that factor; zero for gains that stay.
-    `out` (3, M, n): q, v, torque; `dout` (3, M, n, c) their tangents, every `every` periods.
+    The period is the number of the last one reached. relative (n, c): derivatives of the logarithm of each joint's
+    gains by the parameters; zero for constant gains. `out` (3, M, n): q, v, torque every `every` periods. `dout` (3, M,
+    n, c): their tangents.
     """
     tree, linear, kinds = plant[0], plant[2], plant[3]
     n, c = relative.shape

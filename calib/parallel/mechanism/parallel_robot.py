@@ -78,7 +78,7 @@ class Leg(Frozen):
         if self.end not in ENDS:
             refuse_robot(location, f"its end '{self.end}' is neither {' nor '.join(ENDS)}")
         if self.home.shape != (n,):
-            refuse_robot(location, f"home has {self.home.size} values for its {n} joints")
+            refuse_robot(location, f"home has {self.home.size} values for its {n} joints: state one per joint")
         if n > self.held:
             refuse_robot(
                 location,
@@ -137,14 +137,16 @@ class ParallelRobot(Frozen):
         names = [leg.name for leg in self.legs]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            self.refuse(f"two legs are called '{twice[0]}'")
+            self.refuse(f"two legs are called '{twice[0]}': rename one")
         if not freedom or not set(self.freedom) <= set(COORDINATES) or len(set(self.freedom)) < self.r:
             self.refuse(
                 f"freedom {freedom or 'is empty'}; it names the platform's independent coordinates, each once, of "
                 f"{', '.join(COORDINATES)}"
             )
         if self.n < self.r:
-            self.refuse(f"{self.n} actuated joints cannot hold a platform of {self.r} freedoms ({freedom})")
+            self.refuse(
+                f"{self.n} actuated joints cannot hold a platform of {self.r} freedoms ({freedom}): actuate more joints"
+            )
         if self.lower.shape != (self.r,) or self.upper.shape != (self.r,) or not (self.lower < self.upper).all():
             self.refuse(
                 f"the platform's limits need one lower and one higher upper value per coordinate ({freedom}); found "

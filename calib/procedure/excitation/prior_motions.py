@@ -1,4 +1,4 @@
-"""Information of earlier motions, recorded or designed, which a new motion complements."""
+"""Information matrices of earlier motions, recorded or designed, which a new motion complements."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,11 +34,16 @@ class PrincipalErrors(Protocol):
 
     @property
     def before(self) -> np.ndarray:
-        """Shifts (b, r) of an earlier identification's parameters by each principal error; zero without one."""
+        """Shifts (b, r) of an earlier identification's parameters by each error; zero without an identification."""
         ...
 
     def felt(self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the changes of the torques (N, rows, r) by each error, at fixed base parameters `values` (b,)."""
+        """Return the changes (N, rows, r) of the torques by each principal error, at constant base parameters.
+
+        Args:
+            values: (b,) base parameters.
+            q, v, a: (N, n) positions, velocities and accelerations.
+        """
         ...
 
 
@@ -48,10 +53,10 @@ class PriorMotions:
 
     Attributes:
         names: names of the files or folders of the motions.
-        seconds: duration of the motions.
-        information: (b, b) ∫ ωᵀω dt of the design's columns, with the rows divided by `sigmas`.
-        sigmas: (rows,) square root of the torque errors' density that an identification states; None: 1.
-        growth: how these errors grow with the motion; None: not known.
+        seconds: duration of the motions [s].
+        information: (b, b) ∫ ωᵀω dt of the design's columns ω, with the rows divided by `sigmas`.
+        sigmas: (rows,) square root of the torque errors' spectral density that an identification states; None: 1.
+        growth: how these errors grow with the motion; None if unknown.
     """
 
     names: tuple[str, ...]
@@ -61,7 +66,12 @@ class PriorMotions:
     growth: ErrorGrowth | None = None
 
     def per_sample(self, count: int, duration: float) -> np.ndarray:
-        """Return the information (b, b) per sample of a new motion of `duration` seconds and `count` samples."""
+        """Return the information (b, b) of the earlier motions in units of one sample of a new motion.
+
+        Args:
+            count: number of samples of the new motion.
+            duration: duration of the new motion [s].
+        """
         return self.information * (count / duration)
 
 
@@ -73,21 +83,22 @@ def read_prior(
     noise: np.ndarray | None = None,
     geometry: PrincipalErrors | None = None,
 ) -> PriorMotions | None:
-    """Return the information from recordings (``log.npz@0:9.4`` cuts) and folders of `calib excite`; None if none.
+    """Return the information of earlier motions from recordings and folders; None if there are none.
 
-    Recordings are filtered and differentiated as by `calib identify`. The information of an identification `after`, its
+    Recordings are filtered and differentiated as in `calib identify`. The information of an identification `after`, its
     prior included, is the inverse of its covariance without the geometry's part.
 
     Args:
-        paths: recordings, or folders of `calib excite`.
+        paths: recordings with optional cuts (``log.npz@0:9.4``), or folders of `calib excite`.
         model: the model to excite.
         chain: the arm.
-        after: folder of an identification; None without one.
-        noise: (rows,) by which torque rows are divided if no identification states their errors; None: 1.
-        geometry: principal errors of the geometry; None if the geometry is taken as exact.
+        after: folder of an identification; None: no identification.
+        noise: (rows,) σ by which torque rows are divided if no identification states their errors; None: 1.
+        geometry: principal errors of the geometry; None: the geometry is taken as exact.
 
     Raises:
-        UsageError, MeasurementError: for a path that is neither, or belongs to another robot.
+        UsageError, MeasurementError: for a path that is neither recording nor folder of a motion, or belongs to another
+            robot.
     """
     if not paths and after is None:
         return None
@@ -124,6 +135,9 @@ def _identified_information(
         folder: folder of the identification.
         model: the model to excite.
         geometry: principal errors; if given, the geometry's part of the covariance is excluded; None: included.
+
+    Raises:
+        UsageError: if the stored covariance or torque errors are missing, damaged or of another model.
     """
     metrics = IdentificationFolder(folder).metrics()
     density = metrics.error_density
@@ -166,11 +180,16 @@ def _growth(folder: Path, model: ExcitedModel) -> ErrorGrowth | None:
 
 
 def designed_orders(folder: Path, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return q, v, a of all periods of a designed motion, sampled at 50 Hz or more, and the sampling rate [Hz]."""
+    """Return q, v, a (N, n) of all periods of a designed motion, sampled at 50 Hz or more, and the sampling rate [Hz].
+
+    Raises:
+        UsageError: if the motion belongs to a robot with other joints.
+    """
     motion = coefficients.read(folder)
     if motion.joint_names != tuple(chain.joint_names):
         raise UsageError(
-            f"{folder}: the motion has joints {', '.join(motion.joint_names)}; {chain.name} has "
+            f"{folder}: the motion is of another robot: it has joints {', '.join(motion.joint_names)}, "
+            f"{chain.name} has "
             f"{', '.join(chain.joint_names)}"
         )
     count = max(MIN_SAMPLES, round(MIN_RATE * motion.period))

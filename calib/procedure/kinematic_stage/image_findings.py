@@ -1,4 +1,4 @@
-"""Findings on the images of a fit: reprojection error, the arm's share of it, image coverage, board scale."""
+"""Findings on the images of a fit: reprojection error, the arm's share of this error, image coverage, board scale."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ MAX_NOISE = 4.0
 
 
 def image_coverage(fit: GeometricFit) -> tuple[ImageCoverage, ...]:
-    """Return how the corners of a fit cover each set of images; empty without images."""
+    """Return how densely the corners in a fit cover the image area, for each set of images; empty without images."""
     result = []
     for piece in fit.pieces:
         block, part = fit.blocks[piece.block].measured, piece.part
@@ -50,12 +50,12 @@ def reprojection(cell: Installation, blocks: Sequence[PoseMeasurements]) -> floa
 
 
 def _rms(residuals: np.ndarray) -> float:
-    """Return the rms distance of residuals (2, k) [px]."""
+    """Return the rms length of residual vectors (2, k) [px]."""
     return float(np.sqrt(np.mean(np.sum(residuals**2, axis=0))))
 
 
 def image_notes(fit: GeometricFit) -> list[Finding]:
-    """Return the findings on the images of a fit; empty without images."""
+    """Return findings on the images of a fit: reprojection error, noise, coverage and scale; empty without images."""
     notes: list[Finding] = []
     without_images = [block.measured for block in fit.blocks if not isinstance(block.measured, Pixels)]
     other_files = [Path(block.file).name for block in without_images]

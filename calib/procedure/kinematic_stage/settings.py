@@ -1,4 +1,4 @@
-"""Settings of pose selection and geometric fit, shared by commands, guided run and scripts."""
+"""Settings of pose selection and geometric fit, shared by commands, guided procedure and scripts."""
 
 from dataclasses import dataclass
 from typing import Annotated

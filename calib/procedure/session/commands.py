@@ -1,10 +1,11 @@
-"""The guided procedure of the commands `calib new`, `calib next`, `calib status` and `calib redo`.
+"""The guided procedure behind the commands `calib new`, `calib next`, `calib status` and `calib redo`.
 
-A waiting session prints two lines: what to do at the robot, and which file to provide in which format.
+A waiting session prints two texts: the task at the robot, and the file to provide with its format.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 from rich.console import RenderableType
@@ -28,7 +29,7 @@ from calib.procedure.measuring.pose_limits import read_limits, tables_of
 from calib.procedure.report import page
 from calib.procedure.robot_kinds import stage_of
 from calib.procedure.session import steps
-from calib.procedure.session.dynamics_steps import unrecorded_payloads
+from calib.procedure.session.dynamics_steps import pick_motion, unrecorded_payloads
 from calib.procedure.session.folder import POSES, UNSEEN, WAYS, Say, Session, create, locked, open_session, read_state
 from calib.procedure.session.geometry_steps import chain_of
 from calib.procedure.session.questions import instrument_named
@@ -51,7 +52,12 @@ MEASURED_FILES = {POSES: "measured.csv", UNSEEN: "validation_measured.csv"}
 
 
 def asks(session: Session, state: State) -> tuple[str, str]:
-    """Return the task at the robot, a line for each part of it, and the file to provide, with the file's format."""
+    """Return two texts for a session that waits: the task at the robot, and the file to provide with its format.
+
+    Args:
+        session: the session.
+        state: status of the step that waits.
+    """
     step, next_command = state.step.name, command_line("next", session.folder)
     if state.kind == WAITING and step in ("record", "predict"):
         task, file = _to_record(session, step)
@@ -59,11 +65,11 @@ def asks(session: Session, state: State) -> tuple[str, str]:
         task, file = _to_measure(session, step)
     else:
         return f"step {step} needs {state.words}", f"put it into {session.folder} and run {next_command} again"
-    return task, f"Bring {file}; then: {next_command}"
+    return task, f"Provide {file}; then: {next_command}"
 
 
 def _to_measure(session: Session, step: str) -> tuple[str, str]:
-    """Return what to measure at the robot, and the files of measurements or images to provide."""
+    """Return two texts: the poses to measure at the robot, and the files of measurements or images to provide."""
     settings, joints = session.settings, chain_of(session).joint_names
     instrument, images = settings.instrument, settings.instrument.measures == IMAGES
     lists = [POSES] if step == "measure" else [UNSEEN]
@@ -108,7 +114,7 @@ def _to_measure(session: Session, step: str) -> tuple[str, str]:
 
 
 def _planned_poses(session: Session, lists: Sequence[str]) -> list[str]:
-    """Return for each list of planned poses that exists its number of poses, its file, and programs of it."""
+    """Return a text on each existing list of planned poses: number of poses, file, and robot programs."""
     if not session.settings.poses.plan:
         return []
     planned = []
@@ -132,7 +138,7 @@ def _numbered(*parts: str) -> str:
 
 
 def _to_record(session: Session, step: str) -> tuple[str, str]:
-    """Return which motions to play, and the logs to provide."""
+    """Return two texts: the motions to play, and the logs to provide."""
     section, joints = session.settings.dynamics, chain_of(session).joints
     names = []
     missing = unrecorded_payloads(session) if step == "record" else []
@@ -198,7 +204,14 @@ COLOURS = {
 
 @dataclass(frozen=True)
 class _Stop:
-    """Result of `go_on`: the waiting step, instructions as lines, and the verdict if the session is complete."""
+    """Result of `go_on`.
+
+    Attributes:
+        session: the session.
+        waiting: status of the step that waits for the user; None: the session is complete.
+        lines: instructions for the user.
+        verdict: level of the session's verdict; empty while the session is not complete.
+    """
 
     session: Session
     waiting: State | None
@@ -225,26 +238,26 @@ def new_session(
     certificate: Mapping[str, object] | None = None,
     **motion: object,
 ) -> Path:
-    """Create the folder of a guided session for a robot, like `calib new`.
+    """Create the folder of a guided session for a robot, like the command `calib new`.
 
     Args:
         folder: new folder.
-        robot, base, tip: as of `calib.load`.
+        robot, base, tip: arguments of `calib.load`.
         instrument: ``cmm``, ``tracker``, ``tracker6d``, ``mocap``, ``camera``, ``other-pose``, ``other-position``, or
-            ``none``: identify the dynamics only, on the geometry of the robot's description.
-        poses, validation: number of poses to choose for the fit, and of poses to measure for validation only.
-        tool: (3,) approximate position of the target in the tip's frame [m]; None: the tip.
-        limits: TOML file of limits for both poses and motions (``calib formats limits``), or its tables; None:
-            defaults.
+            ``none``: only the dynamics are identified, on the geometry of the robot's description.
+        poses, validation: number of poses to select for the fit, and number of held-out poses for the validation.
+        tool: (3,) approximate position of the target in the tip's frame [m]; None: default of ``session.toml``.
+        limits: TOML file of limits for both poses and motions (``calib formats limits``), or its content as tables;
+            None: defaults.
         dynamics: whether to identify the dynamics, too.
         seed: seed of all random numbers.
-        program: controller in whose language the poses are written, too (`calib program --list`); empty: none.
-        tolerance_mm: largest accepted rms on unseen poses [mm]; 0: none.
-        certificate: keys of ``[certificate]``: entries of the certificate besides results.
+        program: robot controller in whose language the poses are written, too (`calib program --list`); empty: none.
+        tolerance_mm: largest accepted rms on held-out poses [mm]; 0: none.
+        certificate: keys of ``[certificate]``: entries of the certificate besides results; None: all are empty.
         motion: other keys of ``[dynamics]`` (``calib formats session``): torques, payloads, period …
 
     Returns:
-        The folder; its ``session.toml`` states the settings of the session.
+        The folder, whose ``session.toml`` contains the settings of the session.
 
     Raises:
         UsageError: if the folder is in use, or a value is not valid.
@@ -275,7 +288,16 @@ def new_session(
 def _limits(
     limits: str | Path | Mapping[str, object] | None, chain: Chain, source: Path, motions: bool
 ) -> tuple[dict[str, Path | str], str]:
-    """Return the files of the given limits (name -> path or text) after checking them, and the limits file's name."""
+    """Return the files with limits that the session needs (name -> path or text), and the name of the limits file.
+
+    The limits are checked by reading them.
+
+    Args:
+        limits: file, folder or tables with limits; None: defaults, which yields no file and an empty name.
+        chain: the arm.
+        source: file of the robot.
+        motions: whether the limits are also used for motions.
+    """
     if limits is None:
         return {}, ""
     if isinstance(limits, str):
@@ -297,18 +319,24 @@ def _limits(
     return {LIMITS: f"{LIMITS_HEAD}{dumps(tables)}", **files}, LIMITS
 
 
-def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", plots: bool = True) -> _Stop:
+def go_on(
+    folder: Path, say: Say, progress: Say, command: str, again: str = "", plots: bool = True, pick: int = 0
+) -> _Stop:
     """Run all steps whose inputs exist, and return the step that waits for input, with instructions.
 
     Args:
         folder: folder of the session.
-        say, progress: functions that print permanent lines, and progress messages.
-        command: name of the command for the record.
-        again: name of a step to repeat, with all steps that depend on it; empty: none.
+        say, progress: functions that print permanent lines and progress messages.
+        command: the running command, to be recorded in the session.
+        again: name of a step to repeat, together with all steps that depend on it; empty: no step.
         plots: whether to draw figures.
+        pick: number of the front's motion that becomes the training motion; 0: none.
     """
     session = open_session(folder, plots)
     with locked(session, say):
+        if pick:
+            step = steps.find(session, "excite")
+            steps.run_instead(session, step, partial(pick_motion, pick), say, progress, command)
         if again:
             steps.forget(session, steps.find(session, again))
         state = steps.run_next(session, say, progress, command)
@@ -318,7 +346,7 @@ def go_on(folder: Path, say: Say, progress: Say, command: str, again: str = "", 
 
 
 def _ending(session: Session) -> tuple[str, ...]:
-    """Return the closing lines of a complete session: the verdict, where certificate and robot are."""
+    """Return the closing lines for a complete session: the verdict, and the paths of certificate and robot."""
     first, *further_pages = PAGES
     page = f"{session.path(first)} ({', '.join(further_pages)})"
     verdicts, further = session.verdicts(), promised(session)
@@ -334,7 +362,7 @@ def _ending(session: Session) -> tuple[str, ...]:
 
 
 def status_lines(folder: Path) -> Iterator[RenderableType]:
-    """Yield the status of every step of a session, and the next command."""
+    """Yield lines on the status of every step of a session, and on the next task or command."""
     session = open_session(folder)
     settings, states = session.settings, steps.states(session)
     pending = [state for state in states if state.kind not in (DONE, KEPT)]
@@ -354,7 +382,7 @@ def status_lines(folder: Path) -> Iterator[RenderableType]:
 
 
 def noted(folder: Path) -> list[str]:
-    """Return the notes of each completed step of a session."""
+    """Return the notes of all completed steps of a session, each beginning with the name of the step."""
     lines = []
     for name, record in read_state(open_session(folder)).steps.items():
         lines += [f"  {name}: {note}" for note in record.notes]

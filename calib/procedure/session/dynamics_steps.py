@@ -1,6 +1,6 @@
-"""Steps of a session for the dynamics: design motions, check recordings, identify, validate on unseen motion.
+"""Steps of a session for the dynamics: design motions, check recordings, identify, validate on held-out motion.
 
-The same functions as `calib excite` and `calib identify`; only the files are the session's.
+The steps call the functions behind `calib excite` and `calib identify` with files in the session's folder.
 """
 
 import re
@@ -17,7 +17,7 @@ from calib.column_changes import Change
 from calib.data.recordings.recording import Recording, parse_cut
 from calib.data.recordings.recording_files import read_recording
 from calib.dynamics.torque_rows import torque_rows
-from calib.errors import CalibError, Finding, finding, refuse_data
+from calib.errors import CalibError, Finding, command_line, finding, refuse_data
 from calib.identification.checks.recorded_motion import (
     EDGE_TIME,
     DesignedMotion,
@@ -29,10 +29,12 @@ from calib.identification.checks.recorded_motion import (
 from calib.identification.identify_options import FileSettings, IdentifyOptions, read_options
 from calib.procedure.dynamic_stage import identify as identifying
 from calib.procedure.dynamic_stage import inputs
+from calib.procedure.dynamic_stage.computed_torque import torque_tests
 from calib.procedure.dynamic_stage.identify import DynamicsAssessment, assess
-from calib.procedure.excitation import coefficients, prediction
+from calib.procedure.excitation import coefficients, prediction, stored_front
 from calib.procedure.excitation.coefficients import Periodic
 from calib.procedure.excitation.settings import ExcitationSettings
+from calib.procedure.excitation.stored_front import StoredFront
 from calib.procedure.findings import UNJUDGED, Note, Verdict, as_notes, lines_of
 from calib.procedure.robot_kinds import joints_of
 from calib.procedure.session.folder import CUTS, MOTION_CHECKED, ROUND, Say, Session
@@ -57,7 +59,10 @@ VALIDATION_FRACTION = 3
 
 
 def options_of(session: Session) -> IdentifyOptions:
-    """Return the identification options from the options file or ``session.toml``, with each recording's payloads."""
+    """Return the identification options from the options file or ``session.toml``, with the payload of each recording.
+
+    A recording carries the payloads whose labels are part of its file name.
+    """
     section = session.settings.dynamics
     options = read_options(session.named(section.options))
     settings = options.settings
@@ -99,7 +104,7 @@ def unrecorded_payloads(session: Session) -> list[str]:
     return [label for label in session.settings.dynamics.payloads if label not in carried]
 
 
-def excite(session: Session, say: Say) -> list[str]:
+def excite(session: Session, say: Say) -> list[str | Note]:
     """Design the training motion and the validation motion, and return notes."""
     section = session.settings.dynamics
     if not section.plan:
@@ -113,7 +118,7 @@ def excite(session: Session, say: Say) -> list[str]:
 
 
 def _training_settings(session: Session) -> ExcitationSettings:
-    """Return the settings of the training motion."""
+    """Return the settings for the design of the training motion, from ``session.toml``."""
     section = session.settings.dynamics
     return ExcitationSettings(
         period=section.period,
@@ -132,7 +137,10 @@ def _training_settings(session: Session) -> ExcitationSettings:
 
 
 def _validation_settings(session: Session) -> ExcitationSettings:
-    """Return the settings of the validation motion: another period and seed, within the training motion's states."""
+    """Return the settings of the validation motion.
+
+    The motion has another period and seed than the training motion, and states within those of the training motion.
+    """
     section = session.settings.dynamics
     return replace(
         _training_settings(session),
@@ -148,7 +156,22 @@ def _validation_settings(session: Session) -> ExcitationSettings:
     )
 
 
-def _design(session: Session, name: str, settings: ExcitationSettings, say: Say) -> list[str]:
+def pick_motion(number: int, session: Session, say: Say) -> list[str | Note]:
+    """Make motion `number` of the front the training motion, design the validation motion for it, and return notes.
+
+    Raises:
+        UsageError: if the training motion has no front, or no such motion.
+    """
+    picked = stored_front.read(session.path("6-excitation/training")).with_designed(number)
+    notes = _design(session, "training", _training_settings(session), say, picked)
+    if session.settings.dynamics.validation:
+        notes += _design(session, "validation", _validation_settings(session), say)
+    return notes
+
+
+def _design(
+    session: Session, name: str, settings: ExcitationSettings, say: Say, picked: StoredFront | None = None
+) -> list[str | Note]:
     """Design a motion, write its folder, and return notes; figures and details of the training motion alone."""
     from calib.procedure.excitation import design
     from calib.procedure.excitation import folder as motion_folder
@@ -161,6 +184,7 @@ def _design(session: Session, name: str, settings: ExcitationSettings, say: Say)
         settings,
         limits=session.named(session.settings.dynamics.limits),
         options=options_of(session).settings,
+        picked=picked,
         progress=report_progress,
     )
     # a session is resumed, not gone on with half a search
@@ -177,13 +201,20 @@ def _design(session: Session, name: str, settings: ExcitationSettings, say: Say)
         f"normalised, {columns} columns; all limits are respected"
     ]
     if name == "training":
-        remarks = (*designed.inputs.limits.bounds.lines(), *designed.notes)
+        notes += [Note(f"{name}: {doubt}", is_warning=True) for doubt in designed.doubts]
+        if designed.front is not None:
+            count = len(designed.front.values)
+            choose = command_line("next", session.folder, "--pick", "N")
+            table = session.path("6-excitation/training") / stored_front.TABLE
+            notes.append(Note(f"{name}: {count} motions to choose from ({table}): {choose}", is_warning=True))
+        remarks = [*designed.inputs.limits.bounds.lines()]
+        remarks += [note for note in designed.notes if note not in designed.doubts]
         notes += [f"{name}: {remark}" for remark in remarks]
     return notes
 
 
 def record(session: Session, say: Say) -> list[str]:
-    """Check the training recordings, and return notes."""
+    """Check the training recordings, and return notes for the user."""
     cuts = {}
     notes = []
     for path in session.brought("training"):
@@ -201,7 +232,14 @@ def record(session: Session, say: Say) -> list[str]:
 
 
 def check_recording(session: Session, path: Path, name: str) -> tuple[list[float] | None, list[str]]:
-    """Return start and end of the designed motion in a recording [s] (None: use the whole recording), and notes.
+    """Return start and end of the designed motion in a recording [s], and notes for the user.
+
+    The start and end are None if no designed motion is expected, so that the whole recording is used.
+
+    Args:
+        session: the session.
+        path: path of the recording.
+        name: name of the designed motion: ``training``, ``validation`` or ``round2`` …
 
     Raises:
         MeasurementError: for wrong units or joint order, another motion, or reversed torques.
@@ -236,16 +274,16 @@ def check_recording(session: Session, path: Path, name: str) -> tuple[list[float
 def check_motion(
     recording: Recording, motion: DesignedMotion, others: Mapping[str, DesignedMotion], repeats: int
 ) -> tuple[LocatedMotion, list[Finding]]:
-    """Find the designed motion in a recording, and return its location and findings.
+    """Find the designed motion in a recording, and return its location with findings on how it was played.
 
     Args:
-        recording: of n joints.
-        motion: the one that was to be played.
-        others: the session's other motions by name, to say if one of them was played instead.
-        repeats: how many repetitions were asked for.
+        recording: the recording.
+        motion: the motion that should have been played.
+        others: the session's other motions by name; if one of them was played instead, the error message names it.
+        repeats: requested number of repetitions.
 
     Raises:
-        MeasurementError: if the motion is not found, with the likely reason.
+        MeasurementError: if the motion is not found; the message states the likely reason.
     """
     located = locate(recording, motion)
     if located is None:
@@ -260,7 +298,14 @@ def check_motion(
 
 
 def _other_motion(recording: Recording, motion: DesignedMotion, change: Change | None) -> Finding:
-    """Return the finding on what a recording contains instead of the designed motion."""
+    """Return a finding on why a recording does not contain the designed motion.
+
+    Args:
+        recording: the recording.
+        motion: the designed motion.
+        change: the change of units, joint order or signs, or the other motion, that explains the recording; None:
+            unknown.
+    """
     if change is None:
         if recording.duration < motion.period:
             return finding("motion-short", duration=recording.duration, period=motion.period)
@@ -282,10 +327,10 @@ def _other_motion(recording: Recording, motion: DesignedMotion, change: Change |
 
 
 def check_torques(recording: Recording, chain: Chain) -> None:
-    """Raise an error if recorded torques have the wrong sign or unit, compared with torques of the nominal masses.
+    """Compare recorded torques with the gravity and inertia torques of the nominal masses.
 
     Raises:
-        MeasurementError: if torques of heavily loaded joints are reversed, or of another magnitude.
+        MeasurementError: if torques of heavily loaded joints have the opposite sign, or another magnitude.
     """
     if chain.inertias is None or recording.kind != "torque":
         return
@@ -310,7 +355,7 @@ def _refuse(recording: Recording, reason: Finding) -> NoReturn:
 
 
 def designed_motions(session: Session) -> dict[str, Periodic]:
-    """Return the session's designed motions by name; empty if no motion was designed."""
+    """Return the designed motions in the session's folder: name -> motion; empty if no motion was designed."""
     if not session.settings.dynamics.plan:
         return {}
     folders = [session.path(f"6-excitation/{name}") for name in ("training", "validation")]
@@ -319,7 +364,7 @@ def designed_motions(session: Session) -> dict[str, Periodic]:
 
 
 def next_round(session: Session) -> str:
-    """Return the name of the round after those whose logs are there: round2, round3 …"""
+    """Return the name of the next further motion: round2, or round3 if a log of round2 exists, and so on."""
     number = 2
     while _logs_of(session, f"{ROUND}{number}"):
         number += 1
@@ -327,12 +372,17 @@ def next_round(session: Session) -> str:
 
 
 def _logs_of(session: Session, name: str) -> list[Path]:
-    """Return the training recordings whose names begin with that of a further motion."""
+    """Return the training recordings whose file names begin with the name of a further motion."""
     return [path for path in session.brought("training") if path.stem.lower().startswith(name)]
 
 
 def _cut_paths(paths: list[Path], cuts: Cuts) -> list[str]:
-    """Return each recording's path with the time range of the motion appended, as ``log.csv@0:9``."""
+    """Return the recordings' paths with the time range of the motion appended, such as ``log.csv@0:9``.
+
+    Args:
+        paths: the recordings.
+        cuts: file name -> start and end of the motion [s]; None: the whole recording.
+    """
     ranges = []
     for path in paths:
         cut = cuts.get(path.name)
@@ -345,7 +395,7 @@ def _cut_paths(paths: list[Path], cuts: Cuts) -> list[str]:
 
 
 def _divided(session: Session) -> tuple[list[str], list[str]]:
-    """Return training recordings and held-out recordings, as paths with time ranges (``log.csv@0:9``)."""
+    """Return training recordings and held-out parts of recordings, as paths with time ranges (``log.csv@0:9``)."""
     cuts = read_json(session.path(CUTS), "calib redo recreates it", Cuts)
     share = session.settings.dynamics.holdout
     training = session.brought("training")
@@ -363,7 +413,7 @@ def _divided(session: Session) -> tuple[list[str], list[str]]:
 def _gathered(
     session: Session, training: Sequence[str], unseen: Sequence[str], say: Say
 ) -> inputs.IdentificationInputs:
-    """Return the inputs of the identification: calibrated robot, training recordings, validation recordings."""
+    """Return the inputs of the identification: calibrated robot, training recordings, and held-out recordings."""
     motions = designed_motions(session)
     options = options_of(session)
     # the options of a recording of the session that is not read here do not apply
@@ -382,7 +432,11 @@ def _gathered(
 
 
 def identify(session: Session, say: Say) -> list[str | Note]:
-    """Identify base parameters and friction on the calibrated geometry; validation files are not used."""
+    """Identify base parameters and friction on the calibrated geometry; held-out recordings are not used.
+
+    Returns:
+        Notes for the user.
+    """
     from calib.procedure.dynamic_stage import folder as identification_outputs
     from calib.procedure.report.outputs import write_model
 
@@ -418,7 +472,7 @@ def identify(session: Session, say: Say) -> list[str | Note]:
 
 
 def predict(session: Session, say: Say) -> list[str | Note]:
-    """Validate the identified model on unseen motion, and write the verdict."""
+    """Validate the identified model on held-out motion, write the verdict, and return notes for the user."""
     training, held_out = _divided(session)
     unseen = session.brought("unseen")
     notes = []
@@ -432,15 +486,18 @@ def predict(session: Session, say: Say) -> list[str | Note]:
     assessment = assess(gathered, folder.dynamics(), folder.findings(), folder.errors(), progress=say)
     # the export is judged by the torques written here
     folder.unseen.write(gathered, assessment)
-    assessment = replace(assessment, verdict=_as_delivered(session, assessment))
+    assessment = replace(assessment, verdict=_as_delivered(session, gathered, assessment))
     folder.unseen.write(gathered, assessment)
     earlier = folder.metrics().warnings
     new_warnings = [warning for warning in assessment.warnings if warning not in earlier]
     return [*notes, str(assessment.verdict), *as_notes(new_warnings, assessment.noticed)]
 
 
-def _as_delivered(session: Session, assessment: DynamicsAssessment) -> Verdict:
-    """Return the verdict on the exported robot; a model that cannot be exported gets the verdict prediction only."""
+def _as_delivered(session: Session, gathered: inputs.IdentificationInputs, assessment: DynamicsAssessment) -> Verdict:
+    """Return the verdict on the exported robot; for a model that cannot be exported, pass becomes prediction only.
+
+    The verdict is fail if the torque error exceeds the tolerance in ``session.toml``.
+    """
     from calib.procedure.export.delivery import Export
 
     verdict = assessment.verdict
@@ -457,8 +514,17 @@ def _as_delivered(session: Session, assessment: DynamicsAssessment) -> Verdict:
         error, model = predicted.exported, "exported robot"
         figure = f"{error:.2f} % of the torque unexplained by the exported robot"
         verdict = replace(verdict, reason=f"{figure} (identified model: {verdict.reason})")
-    tolerance = session.settings.dynamics.tolerance_percent
-    if not tolerance or error <= tolerance:
+    section = session.settings.dynamics
+    excesses = []
+    if section.tolerance_percent and error > section.tolerance_percent:
+        excesses.append(
+            f"the {model} has an error of {error:.2f} %, above the tolerance of {section.tolerance_percent:g} %"
+        )
+    rows = gathered.options.settings.torque_rows.titles(gathered.chain.joint_names)
+    tests = torque_tests(section.tolerance_torque, assessment.proofs, rows)
+    failed = [f"{test.row} {test.rms:.3g} (tolerance {test.tolerance:g})" for test in tests if not test.passed]
+    if failed:
+        excesses.append(f"rms torque errors [N m or N] of the identified model above tolerance: {', '.join(failed)}")
+    if not excesses:
         return verdict
-    excess = f"the {model} has an error of {error:.2f} %, above the tolerance of {tolerance:g} %"
-    return Verdict("fail", f"{verdict.reason}; {excess}")
+    return Verdict("fail", "; ".join([verdict.reason, *excesses]))

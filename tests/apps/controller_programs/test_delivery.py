@@ -62,7 +62,7 @@ def test_controllers_say_what_they_take(fit):
     """Every controller says what it takes and what is closed."""
     for name, each in controllers().items():
         out = delivery_text(fit[0], each)
-        assert "It takes: " in out and "It does not: " in out and "instrument seen: " in out, name
+        assert "The controller accepts: " in out and "It does not accept: " in out and "instrument seen: " in out, name
 
 
 def test_signs_and_coupled_axes_are_undone():

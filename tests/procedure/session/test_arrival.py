@@ -72,7 +72,7 @@ def test_answers_are_checked_as_they_come() -> None:
     given = with_answer(with_answer(given, ask["payloads"], "loaded=3.28"), ask["dynamics"], "yes")
     assert not ask["payloads"].open(given) and ask["torques"].open(given)
     found = checked(with_answer(given, ask["torques"], "both"))
-    assert found["payloads"] == {"loaded": 3.28} and found["tool"] == (0.05, 0.0, 0.05) and found["dynamics"]
+    assert found["payloads"] == {"loaded": {"mass": 3.28}} and found["tool"] == (0.05, 0.0, 0.05) and found["dynamics"]
     with pytest.raises(UsageError, match="geometry-only"):
         checked(Answers("ur5", "cmm", dynamics=False, torques="both"))
 

@@ -13,7 +13,7 @@ from sessions import begin
 from calib.data.poses.fit_options import FitOptions
 from calib.dynamics.torque_rows import torque_rows
 from calib.errors import SessionError, UsageError
-from calib.identification.settings import IdentificationSettings
+from calib.identification.settings import IdentificationSettings, Payload
 from calib.procedure.answers import CertificateSection
 from calib.procedure.excitation.settings import HARMONICS, ExcitationSettings
 from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
@@ -49,11 +49,11 @@ def test_session_before_typed_settings_opens(old: Path) -> None:
     """A session of the version before typed settings opens."""
     found = open_session(old.parent).settings
     assert (found.poses.fit, found.instrument.tool) == (16, (0.3, 0.05, 0.02))
-    assert found.seed == 1 and found.fit.tolerance_mm == 0.0 and found.dynamics.payloads == {"loaded": 3.28}
+    assert found.seed == 1 and found.fit.tolerance_mm == 0.0 and found.dynamics.payloads == {"loaded": Payload(3.28)}
     then = tomllib.loads(OLD)
     then["robot"] |= {"controller": ""}
     then["fit"] |= {"deliverable": "urdf", "holdout": 0.0, "rounds": 3}
-    then["dynamics"] |= {"holdout": 0.0, "goals": [], "hard": [], "front": 0, "sigma_percent": 0.0}
+    then["dynamics"] |= {"holdout": 0.0, "goals": [], "hard": [], "front": 0, "sigma_percent": 0.0, "tolerance_torque": []}
     then["certificate"] = dict.fromkeys(vars(CertificateSection()), "")
     assert tomllib.loads(written(found)) == then, "nothing else is added, lost or spelled otherwise"
 
@@ -139,7 +139,7 @@ OWN = {
     "poses": {"fit", "validation", "plan", "constraints"},
     "dynamics": {
         "wanted", "plan", "validation", "harmonics", "repeats", "limits", "torques", "options", "tolerance_percent",
-        "sigma_percent",
+        "sigma_percent", "tolerance_torque",
         "payloads", "holdout",
     },
 }  # fmt: skip

@@ -1,7 +1,7 @@
 """Certificates and reports as HTML (one file without external resources) and as PDF (PDF/A-2b, by Typst).
 
-The templates only arrange the texts of the records. The PDF's font is the one delivered with matplotlib; the computer's
-own fonts are used only for letters that it lacks.
+The templates only arrange the texts of the records. The PDF uses the font that matplotlib contains; fonts installed on
+the computer are used only for letters that this font lacks.
 """
 
 import json
@@ -28,7 +28,7 @@ STANDARD = "a-2b"
 
 
 def write(folder: Path, certificate: Certificate, report: Page) -> list[str]:
-    """Write a certificate as HTML and PDF and the report into a folder; return notes for the user."""
+    """Write a certificate as HTML and PDF, and the report as HTML, into a folder; return notes for the user."""
     document, notes = pdf(certificate)
     for name, content in zip(PAGES, (html(certificate), document, html(report))):
         if content:
@@ -39,7 +39,7 @@ def write(folder: Path, certificate: Certificate, report: Page) -> list[str]:
 
 
 def write_figures(folder: Path, page: Page) -> int:
-    """Write the figures of a report as SVG into a folder, numbered by section; return their number."""
+    """Write the figures of a report as SVG into a folder, numbered by section; return the number of figures."""
     from calib.procedure.report.charts import vector
 
     count = 0
@@ -64,8 +64,8 @@ def html(page: Page) -> str:
 def pdf(page: Certificate) -> tuple[bytes, list[str]]:
     """Return a certificate as PDF, and notes for the user.
 
-    If it would have more than `MAX_PAGES` pages, which only very long entries cause, it is set in smaller type. The PDF
-    is empty in a process forked from one that has used Typst, whose threads do not exist after a fork.
+    A certificate above `MAX_PAGES` pages, which only very long entries cause, is set in smaller type. The PDF is empty
+    in a process forked from one that has used Typst, since Typst's threads do not exist after a fork.
     """
     if _first_user() != os.getpid():
         return b"", [f"{PAGES[1]} was not written, since this process was forked: start processes by spawn"]
@@ -98,7 +98,7 @@ def pages(document: bytes) -> int:
 
 
 def _typeset(inputs: Mapping[str, bytes], dense: bool) -> tuple[bytes, list[str]]:
-    """Return the PDF of a template and its inputs, and a note on letters that no font has."""
+    """Return the PDF made from the given files (template and contents), and a note on letters that no font has."""
     import typst  # 80 MB, and needed for nothing else
 
     notes: list[str] = []
@@ -115,12 +115,12 @@ def _typeset(inputs: Mapping[str, bytes], dense: bool) -> tuple[bytes, list[str]
             lacking = re.search('the text `"(.*)"` could not be displayed', str(error))
             if lacking is None or not standard:
                 raise
-            notes = [f"{PAGES[1]}: no font here has {lacking[1]!r}: a box stands for it; {PAGES[0]} shows it"]
+            notes = [f"{PAGES[1]}: no font here has {lacking[1]!r}: a box replaces it; {PAGES[0]} shows it"]
     raise AssertionError("without a standard every letter is accepted")
 
 
 def _fonts() -> Iterator[tuple[list[str], Any]]:
-    """Yield lists of fonts to try in this order, with the PDF standard; None: plain PDF."""
+    """Yield lists of fonts in the order of the trials, each with a PDF standard; None: PDF without a standard."""
     import typst
 
     yield [FONT], STANDARD
