@@ -24,7 +24,10 @@ MAX_LETTERS = 200
 def _entry(value: object) -> object:
     """Return an entry of a certificate (text, number or date) as one line of printable text.
 
-    Other values are returned unchanged.
+    Values of other types are returned unchanged.
+
+    Args:
+        value: the entry.
 
     Raises:
         ValueError: for a text that is too long.

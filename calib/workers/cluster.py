@@ -36,8 +36,9 @@ class _Cluster:
         return self._threads() - len(self.under_way)
 
     def _threads(self) -> int:
-        """Return the number of threads of all workers (1 without workers); the scheduler is asked at most once per
-        second.
+        """Return the number of threads of all workers (1 without workers).
+
+        The scheduler is asked at most once per second.
 
         Raises:
             CalibError: if there have been no workers for `NO_WORKERS` seconds.
@@ -56,7 +57,7 @@ class _Cluster:
         return self.threads
 
     def _said(self, ask: Callable[[], T]) -> T:
-        """Return the result of a function that asks the scheduler.
+        """Return the result of `ask`, a function without arguments that asks the scheduler.
 
         Raises:
             CalibError: if the scheduler does not answer.
@@ -101,7 +102,13 @@ class _Cluster:
         yield self.under_way.pop(future.key)[0], result, raised
 
     def _failed(self, error: Exception) -> Exception:
-        """Return the exception that is reported as the result of a task if Dask, and not the task, has failed."""
+        """Return the exception to report as the result of a task that Dask could not run.
+
+        Exceptions of the task itself are results and are not passed to this function.
+
+        Args:
+            error: exception that Dask raised.
+        """
         from distributed import KilledWorker  # pyright: ignore[reportMissingImports]
 
         if isinstance(error, KilledWorker):
@@ -135,7 +142,9 @@ def _on_cluster(call: bytes) -> bytes:
 
 
 async def _answers(address: str) -> None:
-    """Check that a Dask scheduler answers within `ANSWER` seconds; Dask's client would wait forever for a silent port.
+    """Check that a Dask scheduler answers at `address` within `ANSWER` seconds.
+
+    Dask's client would wait forever for a port that accepts connections but does not answer.
 
     Raises:
         OSError: without an answer.

@@ -30,12 +30,13 @@ class Statements:
 
     Attributes:
         tool: ``flange`` (the all-zero tool), a tool of the fit, or ``x,y,z[,roll,pitch,yaw]`` in the controller's
-            flange [m, rad]; None: the tool is read from the program.
+            flange [m, rad]; None: the tool of each pose is read from the program.
         user: ``x,y,z[,roll,pitch,yaw]`` of the user frame in the controller's base [m, rad]; None: the frame is read
             from the program.
         world: (4, 4) pose of the controller's base in the arm's base; None: known from the robot's description, or from
             the controller's rule.
-        flange: (4, 4) pose of the controller's flange in the arm's tip; None: as for `world`.
+        flange: (4, 4) pose of the controller's flange in the arm's tip; None: known from the robot's description, or
+            from the controller's rule.
         files: file name to text, of further files of the controller.
     """
 
@@ -138,6 +139,11 @@ def tool_in_tip(fitted: Fitted, controller: Controller, statements: Statements) 
 
     Used for joint targets, since a program does not name a tool for them.
 
+    Args:
+        fitted: the calibrated arm with its tools.
+        controller: the program's controller, which defines the flange.
+        statements: what the user specifies about the frames.
+
     Raises:
         UsageError: a tool that cannot be parsed, or a controller whose flange is not known.
     """
@@ -160,7 +166,14 @@ def _as_option(pose: np.ndarray) -> str:
 def _grouped(
     program: Program, program_frames: ProgramFrames, tools: Mapping[str, str], users: Mapping[str, np.ndarray]
 ) -> tuple[Group, ...]:
-    """Return the program's poses grouped by tool and configuration, the groups in order of first appearance."""
+    """Return the program's poses grouped by tool and configuration, the groups in order of first appearance.
+
+    Args:
+        program: a program with poses.
+        program_frames: tool, user frame and configuration of each pose.
+        tools: name of a tool in the program to the tool in the form that `joint_commands.placements` accepts.
+        users: name of a user frame in the program to its pose (4, 4) in the frame of the targets.
+    """
     settings = program_frames.settings
     members: dict[tuple[str, str], list[int]] = {}
     for k, setting in enumerate(settings):
@@ -177,7 +190,15 @@ def _grouped(
 
 
 def _stated_tool(statement: str | None, names: Sequence[str]) -> np.ndarray | None:
-    """Return the specified tool's pose (4, 4) in the controller's flange; None where no tool is specified."""
+    """Return the specified tool's pose (4, 4) in the controller's flange; None where no tool is specified.
+
+    Args:
+        statement: ``flange`` or ``x,y,z[,roll,pitch,yaw]`` [m, rad]; None: not specified.
+        names: names of the fit's tools, for the error message.
+
+    Raises:
+        UsageError: any other text.
+    """
     if statement == "flange":
         return np.eye(4)
     try:
@@ -238,7 +259,13 @@ def _completed(
 
 
 def _advice(program: Program, kind: str, option: str) -> str:
-    """Return a text that explains how the user can specify the numbers of a tool or a user frame."""
+    """Return a text that explains how the user can specify the numbers of a tool or a user frame.
+
+    Args:
+        program: the program, whose controller names the reference frame.
+        kind: ``tool`` or ``user``.
+        option: name of the option by which the frame is specified.
+    """
     frame = program.controller.base
     if kind == "tool":
         frame = program.controller.flange

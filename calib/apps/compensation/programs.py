@@ -104,6 +104,10 @@ class CompensatedProgram:
     def write(self, out: Path, partial: bool) -> Path:
         """Write the program with its new targets and return its path.
 
+        Args:
+            out: file of the new program.
+            partial: also write the program if some targets are not reached; their numbers are unchanged.
+
         Raises:
             UsageError: no target is reached, or, without `partial`, some are not; nothing is written.
         """
@@ -169,7 +173,14 @@ def compensated(
 
 
 def _check_postures(fitted: Fitted, program: Program, groups: Sequence[Group], start: Sequence[float] | None) -> None:
-    """Raise UsageError if poses have no configuration and no start is given."""
+    """Raise UsageError if poses have no configuration and no start is given.
+
+    Args:
+        fitted: the calibrated arm, whose nominal arm may have a spherical wrist (configurations require one).
+        program: the program.
+        groups: its poses by tool and configuration.
+        start: (n,) joint values that decide between configurations; None: not given.
+    """
     if start is not None:
         return
     spherical = has_spherical_wrist(fitted.nominal.chain)
@@ -190,7 +201,15 @@ def _check_postures(fitted: Fitted, program: Program, groups: Sequence[Group], s
 def _compensated_group(
     fitted: Fitted, program: Program, group: Group, start: Sequence[float] | None, options: FieldValues
 ) -> Part:
-    """Return the joint commands and new numbers for the poses of one group."""
+    """Return the joint commands and new numbers for the poses of one group.
+
+    Args:
+        fitted: the calibrated arm.
+        program: the program.
+        group: the poses, with one tool and one configuration.
+        start: (n,) joint values near which the joint values of poses are sought [rad]; None: not given.
+        options: frame, seed and further arguments of `joint_commands.computed`.
+    """
     controller = program.controller
     model, _ = placements(fitted, options["frame"], group.tool)
     chain = model.chain
@@ -215,7 +234,12 @@ def _compensated_group(
 
 
 def _without(commands: Commands, reasons: Sequence[str]) -> Commands:
-    """Return the commands with those marked as not reached that have a non-empty reason in `reasons` (m,)."""
+    """Return the commands, those with a non-empty text in `reasons` marked as not reached for that reason.
+
+    Args:
+        commands: m joint commands.
+        reasons: (m,) texts.
+    """
     reached = commands.reached.copy()
     command_reasons = list(commands.reason)
     for k, reason in enumerate(reasons):
@@ -232,6 +256,13 @@ def _posture_notes(
 
     A configuration is contradictory if no posture at the pose has it, or if the posture nearest to the start has
     another.
+
+    Args:
+        program: the program.
+        group: the poses, with one tool and one configuration.
+        configuration: the configuration that the program prescribes.
+        commands: the joint commands at these poses.
+        sought: the nominal arm's postures at these poses.
     """
     notes = []
     reached = commands.reached

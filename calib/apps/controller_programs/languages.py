@@ -127,21 +127,32 @@ class Language:
 def _frame(form: str) -> str:
     """Return the regular expression for a short pattern of a frame.
 
-    In the pattern, NUM is a number, and a blank is any number of blanks.
+    Args:
+        form: the pattern, in which NUM is a number and a blank is any number of blanks.
     """
     return form.replace(" ", r"\s*").replace("NUM", NUMBER)
 
 
 def _posed(match: re.Match[str], first: int, controller: Controller, count: int = 6) -> np.ndarray:
-    """Return the pose (4, 4) [m] from `count` numbers in a regular expression's match, from group `first` on."""
+    """Return the pose (4, 4) [m] that consecutive groups of a regular expression's match contain.
+
+    Args:
+        match: the match.
+        first: index of the first group with a number.
+        controller: the controller, which determines units and angles.
+        count: number of numbers.
+    """
     values = [float(match[group]) for group in range(first, first + count)]
     return pose_of_values(controller, np.array([values]))[0]
 
 
 def _either(pairs: set[tuple[str, str]]) -> tuple[str, str]:
-    """Return tool and user frame of the moves (tool, user frame) that use one target.
+    """Return tool and user frame of the moves that use one target.
 
     Where moves differ, their names are joined by 'or'; no frame has such a name.
+
+    Args:
+        pairs: (tool, user frame) of each move.
     """
     tools = {tool for tool, _ in pairs}
     users = {user for _, user in pairs}
@@ -173,6 +184,11 @@ def _tp_name(text: str, kind: str, number: str) -> str:
 
     For the number ``F`` (the active frame), it is the only frame that the program selects; empty if it selects none or
     several.
+
+    Args:
+        text: the program without comments.
+        kind: beginning of the name, ``UTOOL`` or ``UFRAME``.
+        number: number of the frame, or ``F``.
     """
     if not number.isdigit():
         selected = set(re.findall(rf"{kind}_NUM\s*=\s*(\d+)", text))
@@ -304,7 +320,11 @@ def _rapid_setting(text: str, target: Target) -> Setting:
 
 
 def _rapid_frames(statement: str) -> tuple[str, str]:
-    """Return the names of tool (the last argument) and work object in the arguments of a RAPID move."""
+    """Return the names of the tool and the work object that a RAPID move uses.
+
+    Args:
+        statement: arguments of the move; the last one is the tool.
+    """
     work = _RAPID_WOBJ.search(statement)
     plain = re.sub(r"\\\w+(?:\s*:=\s*\w+)?", "", statement)
     tool = re.search(r",\s*([A-Za-z_]\w*)\s*$", plain)

@@ -66,10 +66,15 @@ def joints_in(path: Path, source: str = "") -> tuple[np.ndarray, list[str]]:
 
 
 def joints_table(path: Path, source: str = "") -> Table:
-    """Return the joint values of `joints_in` as a table [deg], with a column ``pose`` where all targets are numbered.
+    """Return the joint values in a file as a table [deg], with a column ``pose`` where all targets are numbered.
 
-    The file may also be one to which a controller wrote joint values: a UR's log, a KUKA's ``.dat``, a FANUC's
-    ``POSREG.VA``.
+    Args:
+        path: CSV of poses, program, or file to which a controller wrote joint values: a UR's log, a KUKA's ``.dat``, a
+            FANUC's ``POSREG.VA``.
+        source: the controller of a program, where its suffix does not determine it; empty otherwise.
+
+    Raises:
+        UsageError: as for `joints_in`.
     """
     q, names = joints_in(path, source)
     header = list(names)
@@ -184,7 +189,13 @@ def write_program(path: Path, out: Path, name: str) -> list[Path]:
 
 
 def _poses(controller: Controller, q: np.ndarray, settings: ProgramSettings) -> list[list[str]]:
-    """Return joint values q (m, n) [rad] as texts in a controller's units and number of decimals."""
+    """Return joint values (m, n) [rad] as texts in a controller's units and number of decimals.
+
+    Args:
+        controller: the controller.
+        q: joint values.
+        settings: settings of the program, of which the pulses per degree are used.
+    """
     values = controller.shown(q)
     if controller.pulses:
         values = values * np.array(settings.pulses)

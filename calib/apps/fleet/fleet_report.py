@@ -105,6 +105,10 @@ class FleetReport(ReportedResult):
 
         The folder contains report.html, fleet.csv (a row per arm) and metrics.json, and for each type a prior for the
         fit of the type's next arm.
+
+        Args:
+            out: the folder.
+            plots: whether figures are drawn.
         """
         out = Path(out)
         folders.check_target(out, OURS, (folders.METRICS,), "fleet report")
@@ -223,7 +227,13 @@ def _displacement_mm(row: ToolUse) -> str:
 
 
 def _error_sigmas(row: ToolUse) -> str:
-    """Return as text how many σ the errors with a tool exceed those with other tools; empty where they do not."""
+    """Return as text how many σ the errors with a tool exceed those with other tools.
+
+    Empty if they do not exceed them.
+
+    Args:
+        row: comparison of arms with the tool against arms with other tools.
+    """
     assert row.times is not None
     if row.times > MIN_TIMES:
         return f"{row.times_sigmas:.1f}"
@@ -289,6 +299,10 @@ def _arms_of_type(types: list[list[Calibration]], calibration: Calibration) -> l
     """Return the list in `types` of the arms with this arm's nominal description.
 
     Where there is no such list, an empty one is appended to `types` and returned.
+
+    Args:
+        types: lists of calibrations, each of arms with one nominal description.
+        calibration: calibration of the arm.
     """
     for arms in types:
         with suppress(RobotError):
@@ -332,9 +346,12 @@ def _arm_type(name: str, arms: Sequence[Calibration]) -> ArmType:
 
 
 def _farthest(calibration: Calibration) -> tuple[str, float]:
-    """Return the name of the parameter that is farthest from nominal, and its relative deviation.
+    """Return the name of the parameter that is farthest from nominal, and its deviation.
 
     The deviation is divided by the plausible one for the parameter's unit (`PLAUSIBLE`).
+
+    Args:
+        calibration: calibration of the arm.
     """
     nominal = calibration.robot.nominal or calibration.chain
     plausible = [PLAUSIBLE[unit] for unit in nominal.units]

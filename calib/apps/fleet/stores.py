@@ -98,7 +98,14 @@ def _opened(address: str) -> tuple[Any, str]:
 
 
 class _Claim:
-    """The file at an address that names the process working on the folder; the constructor takes the claim."""
+    """The file at an address that names the process working on the folder; the constructor takes the claim.
+
+    Args:
+        files: file system of fsspec.
+        address: address of the folder, for messages.
+        path: path of the file in the file system.
+        lease: time [s] after which a claim that was not renewed is taken over.
+    """
 
     def __init__(self, files: Any, address: str, path: str, lease: float) -> None:
         self.files, self.address, self.path, self.beats = files, address, path, 0

@@ -83,7 +83,9 @@ def join(
         points: CSV file of measured points.
         by: ``name``, ``time``, ``row``, ``geometry`` or ``motion``; empty: the first of these for which both files have
             columns, except ``motion``.
-        robot, base, tip: the nominal robot, as for `calib.load`, by whose geometry the order is checked or found.
+        robot: the nominal robot, by whose geometry the order is checked or found: library name, file, folder of a fit,
+            or in memory; None: not checked.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
 
     Returns:
         The table, the index of each row's pose, and notes; ``write(path)`` writes the CSV that `fit_geometry` reads. By
@@ -270,7 +272,10 @@ def merged(
 
 
 def _positions(sheet: Sheet) -> np.ndarray:
-    """Return measured positions (m, 3) [m]; NaN where none was measured. Of several targets, the first one is used."""
+    """Return measured positions (m, 3) [m] of the m rows of `sheet`; NaN where none was measured.
+
+    Of several targets, the first one is used.
+    """
     columns = sheet.family(POSITION.names) or sheet.family(POSITION.names, "1")
     if not columns:
         refuse_data(sheet.table.file, f"has no x, y, z; found {', '.join(sheet.table.header)}")
@@ -309,6 +314,12 @@ def _averaged(points: Table, name: str, groups: dict[int, np.ndarray], position:
     """Return a column of the points with one cell per group of readings.
 
     The cell is the mean for measured numbers; otherwise it is the cell of the reading nearest to the mean position.
+
+    Args:
+        points: table of the m points.
+        name: name of the column.
+        groups: pose to indices of its readings.
+        position: (m, 3) measured positions [m].
     """
     cells = points.cells[points.index(name)]
     if _MEASURED.fullmatch(name) and cells.dtype == float:
@@ -330,7 +341,12 @@ def _labels(joints: Table) -> list[str]:
 
 
 def _same_names(joints: Table, points: Table, joint_column: str, point_column: str) -> np.ndarray:
-    """Return for each point the row of joints with the point's name, (m,); -1 where no row has it."""
+    """Return for each point the row of joints with the point's name, (m,); -1 where no row has it.
+
+    Args:
+        joints, points: tables of joint values and of points.
+        joint_column, point_column: names of the columns with the names of poses.
+    """
     point_names = points.texts(point_column)
     joint_names = joints.texts(joint_column)
     # first by the whole names, then by their numbers
@@ -345,7 +361,7 @@ def _same_names(joints: Table, points: Table, joint_column: str, point_column: s
 
 
 def _plain(text: str) -> str:
-    """Return a name in comparable form: lower-case letters and digits, without leading zeros.
+    """Return the name `text` in comparable form: lower-case letters and digits, without leading zeros.
 
     ``P_007`` becomes ``p7``.
     """
@@ -354,7 +370,7 @@ def _plain(text: str) -> str:
 
 
 def _number(text: str) -> str:
-    """Return the last number in a name without leading zeros, or the whole name where it has no number."""
+    """Return the last number in the name `text` without leading zeros; the whole name if it has no number."""
     numbers = re.findall(r"\d+", text) or [text]
     return numbers[-1].lstrip("0")
 
@@ -407,12 +423,21 @@ def _at_times(
 
 
 def _interpolated(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the values (N, k) of series at times t (N,), linearly interpolated at `times` (m,): (m, k)."""
+    """Return the values of a time series, linearly interpolated at other times: (m, k).
+
+    Args:
+        times: (m,) times of the result [s].
+        t: (N,) times of the series [s], rising.
+        values: (N, k) the series.
+    """
     return np.column_stack([np.interp(times, t, column) for column in values.T])
 
 
 def _seconds(table: Table, name: str) -> np.ndarray:
-    """Return a column of times (m,) [s]: numbers in the header's unit, or ISO 8601 dates and times."""
+    """Return the column `name` of a table as times (m,) [s].
+
+    The column contains numbers in the header's unit, or ISO 8601 dates and times.
+    """
     column = table.index(name)
     if table.cells[column].dtype == float:
         return table.numbers(name, None) * table.factor(column, TIMES, "")

@@ -100,6 +100,10 @@ class DriftFound(ChartedResult, ReportedResult):
         """Write the result into a folder and return its path.
 
         The folder contains report.html, trends.csv, metrics.json, and the figure as PNG.
+
+        Args:
+            out: the folder.
+            plots: whether figures are drawn.
         """
         rows: list[tuple[object, ...]] = []
         for trend in self.trends:
@@ -158,11 +162,12 @@ def drift(
     """Return how the target drifts with time and temperature, from poses that were measured more than once.
 
     Args:
-        robot, base, tip: the arm, as for `calib.load`.
+        robot: the arm: library name, file (URDF, or MDH table in TOML), or folder of a fit.
         measured: CSV files with some poses measured several times, and columns ``time`` or ``temperature``; all from
             one station of the instrument.
         settings: displacement above which the drift is not acceptable, and σ of the instrument.
-        options: as for `fit_geometry`.
+        options: options for reading the files (`calib formats options`): TOML file, or in memory; None: defaults.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
 
     Raises:
         UsageError: no pose was measured twice.

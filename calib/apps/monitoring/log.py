@@ -95,7 +95,11 @@ class LogLine:
         return f"{change.name} {plus_minus(change.alone, change.alone_sigma, change.unit)}"
 
     def row(self, robot: str) -> tuple[object, ...]:
-        """Return the cells of the log's table, in the order of `HEADER`."""
+        """Return the cells of the log's table for this calibration, in the order of `HEADER`.
+
+        Args:
+            robot: name of the robot.
+        """
         nominal, calibrated = self.errors or (None, None)
         motion, sigma = self.moved or (None, None)
         change: tuple[object, ...] = ("", None, None, "")
@@ -159,6 +163,10 @@ class RobotLog(ChartedResult, ReportedResult, WithoutVerdict):
         """Write the log into a folder and return its path.
 
         The folder contains report.html, log.csv, metrics.json, and the figure as PNG.
+
+        Args:
+            out: the folder.
+            plots: whether figures are drawn.
         """
         charts: dict[str, Chart] = {}
         if plots:
@@ -241,9 +249,12 @@ def log(folders: Sequence[str | Path], *, mixed: bool = False) -> RobotLog:
 
 
 def _check_same(attribute: str, names: Sequence[str], mixed: bool) -> None:
-    """Raise UsageError if sessions have different names (or serial numbers), unless `mixed`.
+    """Raise UsageError if sessions have different names (or serial numbers) of the robot, unless `mixed`.
 
-    Empty names are ignored.
+    Args:
+        attribute: what differs, for the message, such as "serial numbers".
+        names: name or serial number of each session; empty texts are ignored.
+        mixed: whether different ones are accepted.
     """
     different = list(dict.fromkeys(name for name in names if name))
     message = f"the sessions have different {attribute} ({', '.join(different)}); give --mixed if they are of one robot"

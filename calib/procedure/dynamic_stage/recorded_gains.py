@@ -53,6 +53,10 @@ class FoundGains:
         """Return the gains (n,) that apply to a motion; None if the motion contains torques instead of currents.
 
         Gains in the options take precedence over identified gains, and these over gains in the recording.
+
+        Args:
+            motion: the motion.
+            options: the options for its recording.
         """
         if options.gains is not None:
             if len(options.gains) not in (1, motion.n):
@@ -105,7 +109,14 @@ def find_gains(
 
 
 def _from_pair(chain: Chain, options: IdentifyOptions, pair: GainPair, motions: Mapping[str, Motion]) -> FoundGains:
-    """Return absolute drive gains, identified from recordings without and with a payload of known mass."""
+    """Return absolute drive gains, identified from recordings without and with a payload of known mass.
+
+    Args:
+        chain: the arm.
+        options: options of the identification with the payload's mass.
+        pair: names of the recordings without and with the payload.
+        motions: path of a recording -> motion.
+    """
     settings = options.settings
     known_values = {f"M{label}": load.mass for label, load in settings.payloads.items() if load.mass is not None}
     for label, load in settings.payloads.items():
@@ -201,6 +212,13 @@ def _case(
     """Return a recording of currents as a `Case`.
 
     The recording is one of `motions`, or else a file in the folder of the options file.
+
+    Args:
+        name: name or path of the recording in the options.
+        chain: the arm.
+        options: options of the identification.
+        motions: path of a recording -> motion, for all recordings of the command.
+        carried: labels of the payloads that the arm carries.
 
     Raises:
         UsageError: if there is no such recording.

@@ -174,6 +174,9 @@ class MotionBounds:
         `MAX` is a value that no real joint reaches. It matters if light links and high torque limits would allow
         accelerations that no robot reaches.
 
+        Args:
+            track: the setpoints.
+
         Raises:
             UsageError: for a violated limit; the message names the joint and the limit.
         """
@@ -181,7 +184,13 @@ class MotionBounds:
         self._check("acceleration", np.abs(track.a).max(axis=0), self.acceleration)
 
     def _check(self, kind: str, peak: np.ndarray, limit: np.ndarray) -> None:
-        """Raise a UsageError if the largest velocity or acceleration (n,) of a joint exceeds its limit (n,)."""
+        """Raise a UsageError if the velocity or acceleration of a joint exceeds its limit.
+
+        Args:
+            kind: ``velocity`` or ``acceleration``.
+            peak: (n,) largest values of the motion.
+            limit: (n,) limits.
+        """
         limit = np.minimum(limit, MAX[kind])
         j = int(np.argmax(peak / limit))
         if not peak[j] <= (1.0 + MAX_EXCESS) * limit[j]:
@@ -286,6 +295,9 @@ class MotionLimits:
         """Yield each violated constraint with a message and the index of the worst of N sampled states.
 
         Joint limits are not checked.
+
+        Args:
+            motion: N sampled states of the motion.
         """
         for limit in self.constraints:
             if isinstance(limit, BoxLimit):
@@ -437,7 +449,13 @@ def _bounds(
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Named points of links: function of joint values q (N, n) with positions (N, k, 3) [m] in the base frame."""
+    """Named points of links: function of joint values q (N, n) with positions (N, k, 3) [m] in the base frame.
+
+    Attributes:
+        chain: the arm.
+        joints: for each of k points, the number (from 1) of the joint behind which it is fixed; 0: fixed to the tip.
+        places: (k, 3) coordinates of the points in the frames behind these joints [m].
+    """
 
     chain: Chain
     joints: tuple[int, ...]
@@ -447,7 +465,7 @@ class Points:
         return self._positions(q, sweep(self.chain, q).poses())
 
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-        """Return the gradient (N, n) of Σ G · points with respect to q, for weights G (N, k, 3)."""
+        """Return the gradient (N, n) of Σ G · points with respect to q (N, n), for weights G (N, k, 3)."""
         kinematics = sweep(self.chain, q)
         points = self._positions(q, kinematics.poses())
         gradient = np.zeros(q.shape)
@@ -473,7 +491,16 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class _PoseLimit:
-    """A constraint of pose selection that is applied to each sampled posture of a motion."""
+    """A constraint of pose selection that is applied to each sampled posture of a motion.
+
+    Attributes:
+        of: the constraint, with k values per posture.
+        name: its name in messages.
+        labels: (k,) names of the values.
+        scale: (k,) numbers [unit] by which values are divided to compare different constraints.
+        groups: (k,) group number of each value; the optimiser gets one smooth function per group.
+        unit: unit of the values.
+    """
 
     of: PoseConstraint
     name: str
@@ -494,7 +521,13 @@ class _PoseLimit:
 
 
 def _position_constraints(settings: LimitsFile, pose_limits: Limits, points: Points) -> list[MotionConstraint]:
-    """Return constraints on the workspace of tip and named points, and all other constraints of pose selection."""
+    """Return constraints on the workspace of tip and named points, and all other constraints of pose selection.
+
+    Args:
+        settings: content of the limits file.
+        pose_limits: limits of pose selection.
+        points: the named points.
+    """
     constraints: list[MotionConstraint] = []
     radius = settings.target.axis_distance
     lowest, highest = settings.target.heights

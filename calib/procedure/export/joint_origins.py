@@ -20,7 +20,12 @@ _WORDS = {"yes", "no", "on", "off", "true", "false", "null"}  # no texts in YAML
 
 
 def block(value: Mapping[str, object], indent: str = "") -> str:
-    """Return the YAML text of a mapping from texts to mappings, texts and finite floats."""
+    """Return the YAML text of a nested mapping in block style.
+
+    Args:
+        value: mapping from texts to mappings, texts and finite floats.
+        indent: blanks at the beginning of each line.
+    """
     lines = []
     for key, item in value.items():
         head = f"{indent}{_text(key)}:"

@@ -138,7 +138,13 @@ def _with_own_meshes(
 
 
 def _with_control(content: str, robot: str, chain: Chain) -> str:
-    """Return a URDF's text with an added <ros2_control> for mock hardware with position commands."""
+    """Return a URDF's text with an added <ros2_control> for mock hardware with position commands.
+
+    Args:
+        content: text of the URDF.
+        robot: name of the robot.
+        chain: the arm, whose joints are controlled.
+    """
     joints = "".join(
         f'    <joint name={quoteattr(name)}>\n      <command_interface name="position"/>\n'
         '      <state_interface name="position"/>\n      <state_interface name="velocity"/>\n    </joint>\n'

@@ -84,7 +84,16 @@ FED_FORWARD = {
 
 
 class IdentifiedParameter(NamedTuple):
-    """A row of ``estimate.csv``; the relative standard deviation `rsd` is in percent; σ is None if not estimated."""
+    """A row of ``estimate.csv``.
+
+    Attributes:
+        name, unit: name and unit of the parameter.
+        expression: text that explains the parameter: the combination of standard parameters that it stands for, or its
+            drive term.
+        value: the estimate.
+        sigma: standard deviation, from torque noise and geometry; None if it was not estimated.
+        rsd: `sigma` in percent of the value; None if it is unknown.
+    """
 
     name: str
     expression: str
@@ -136,7 +145,11 @@ def read(folder: Path) -> DynamicReport:
 
 
 def read_lines(inputs: IdentificationInputs) -> list[str]:
-    """Return lines of text that list the robot and the recordings that were read."""
+    """Return lines of text that list the robot and the recordings that were read.
+
+    Args:
+        inputs: robot and recordings of the identification.
+    """
     chain = inputs.chain
     lines = [str(inputs.robot)]
     if isinstance(chain, Chain):
@@ -149,7 +162,12 @@ def read_lines(inputs: IdentificationInputs) -> list[str]:
 
 
 def _recording_line(case: Case, role: str) -> str:
-    """Return a line of text on a recording: name, duration, rate, kind of torque, payload, and use."""
+    """Return a line of text on a recording: name, duration, rate, kind of torque, payload, and use.
+
+    Args:
+        case: the recording.
+        role: its use, such as ``unseen``.
+    """
     motion = case.motion
     # a recording cut as log.npz@10: ends with a colon
     name = case.name.rstrip(":")
@@ -177,7 +195,11 @@ def of_outcome(outcome: IdentificationOutcome, folder: Path | None = None) -> Dy
 
 
 def outcome_section(outcome: IdentificationOutcome) -> page.Section:
-    """Return the console output on an identification: the report section without figures and parameters."""
+    """Return the console output on an identification: the report section without figures and parameters.
+
+    Args:
+        outcome: the identification.
+    """
     return report_section(of_outcome(outcome), {})
 
 
@@ -240,7 +262,11 @@ def _test_table(unseen: UnseenReport, tolerances: Sequence[float]) -> page.Repor
 
 
 def _parameter_table(estimate: Sequence[IdentifiedParameter]) -> page.ReportTable:
-    """Return the table of identified parameters with value, σ and relative standard deviation."""
+    """Return the table of identified parameters with value, σ and relative standard deviation.
+
+    Args:
+        estimate: the parameters.
+    """
     header = ("parameter", "unit", "value", "σ", "RSD", "contents")
     rows = []
     for parameter in estimate:
@@ -256,6 +282,9 @@ def warnings_of(report: DynamicReport) -> list[str]:
     """Return the warnings of identification and validation without duplicates.
 
     The warning that there is no held-out motion is omitted if the validation has such motion.
+
+    Args:
+        report: stored results of the identification.
     """
     refuted: list[str] = []
     if report.unseen.proofs:
@@ -270,6 +299,9 @@ def proof_of(unseen: UnseenReport) -> tuple[str, Score, str]:
 
     It is the held-out recording with the largest error; without held-out motion, the training recording with the
     largest error.
+
+    Args:
+        unseen: report on the model's errors.
     """
     scores, motion = unseen.fit, "the training motion"
     if unseen.proofs:
@@ -327,7 +359,7 @@ def _key_figures(unseen: UnseenReport, tolerance: float, delivered: float | None
 
 
 def percent(value: float) -> str:
-    """Return a percentage with three significant digits as text; a dash if it is not finite."""
+    """Return a percentage `value` [%] with three significant digits as text; a dash if it is not finite."""
     return _number(value, " %")
 
 
@@ -337,7 +369,11 @@ def _rsd(percent: float) -> str:
 
 
 def _error_table(unseen: UnseenReport) -> page.ReportTable:
-    """Return the table of torque errors for each recording and torque row."""
+    """Return the table of torque errors for each recording and torque row.
+
+    Args:
+        unseen: report on the model's errors.
+    """
     groups = {}
     for name, score in unseen.fit.items():
         groups[f"{name} (fitted)"] = _error_rows(score, unseen)
@@ -348,7 +384,12 @@ def _error_table(unseen: UnseenReport) -> page.ReportTable:
 
 
 def _error_rows(score: Score, unseen: UnseenReport) -> Iterator[Sequence[str]]:
-    """Yield the rows of the error table for one recording: first all torques together, then each torque row."""
+    """Yield the rows of the error table for one recording: first all torques together, then each torque row.
+
+    Args:
+        score: score of the model on the recording.
+        unseen: report on the model's errors, with the names of the torque rows.
+    """
     parts = score.raw, score.filtered, score.moving, score.standing
     totals = [percent(part.total) for part in parts]
     yield "all", "", "", *totals, "", ""
@@ -360,7 +401,13 @@ def _error_rows(score: Score, unseen: UnseenReport) -> Iterator[Sequence[str]]:
 
 
 def rms_words(score: Score, unseen: UnseenReport, row: int) -> tuple[str, str]:
-    """Return as texts a torque row's rms error in its unit, and in percent of its limit; "–" if unknown."""
+    """Return as texts a torque row's rms error in its unit, and in percent of its limit; "–" if unknown.
+
+    Args:
+        score: score of the model on a recording.
+        unseen: report with units and limits of the torque rows.
+        row: index of the torque row, from 0.
+    """
     rms = score.raw.rms[row]
     if not np.isfinite(rms):
         return "–", "–"
@@ -375,7 +422,11 @@ def _of_all(row: Sequence[str]) -> bool:
 
 
 def _reference_table(unseen: UnseenReport) -> page.ReportTable:
-    """Return the table of errors on held-out motion by the plain references and by the model; may be empty."""
+    """Return the table of errors on held-out motion by the plain references and by the model; may be empty.
+
+    Args:
+        unseen: report on the model's errors.
+    """
     header = ("recording", "nominal masses, no friction", "plain least squares", "this model")
     rows = []
     for recording, references in unseen.references.items():
@@ -386,7 +437,11 @@ def _reference_table(unseen: UnseenReport) -> page.ReportTable:
 
 
 def _interval_table(unseen: UnseenReport) -> page.ReportTable:
-    """Return the table of the coverage of predicted 95 % intervals on held-out recordings; may be empty."""
+    """Return the table of the coverage of predicted 95 % intervals on held-out recordings; may be empty.
+
+    Args:
+        unseen: report on the model's errors.
+    """
     groups = {}
     for name, score in unseen.validation.items():
         coverage = score.interval95
@@ -408,7 +463,11 @@ def _interval_table(unseen: UnseenReport) -> page.ReportTable:
 
 
 def _friction_table(metrics: ModelMetrics) -> page.ReportTable:
-    """Return the table of the tried friction models with their errors on held-out time, in total and by torque row."""
+    """Return the table of the tried friction models with their errors on held-out time, in total and by torque row.
+
+    Args:
+        metrics: metrics of the identification.
+    """
     count = max(len(step.joints_percent) for step in metrics.ladder)
     joints = [str(j + 1) for j in range(count)]
     header = ["friction", "p", "total", *joints, "kept at joints"]
@@ -432,7 +491,11 @@ def _rounded(share: float, digits: int) -> str:
 
 
 def _model_sentences(metrics: ModelMetrics) -> list[str]:
-    """Return sentences on the model: ripple, couplings, method, number of parameters, and eliminated parameters."""
+    """Return sentences on the model: ripple, couplings, method, number of parameters, and eliminated parameters.
+
+    Args:
+        metrics: metrics of the identification.
+    """
     lines = [_ripple_sentence(ripple) for ripple in metrics.ripple]
     lines += _coupling_sentences(metrics)
     lines.append(f"method {metrics.method}: assumes that {metrics.method_assumes}")
@@ -477,6 +540,9 @@ def _coupling_sentences(metrics: ModelMetrics) -> list[str]:
     """Return sentences on how much each coupling term between two joints lowers the errors of these joints.
 
     The physical cause of a coupling is not stated, since nobody measured it in the drives.
+
+    Args:
+        metrics: metrics of the identification.
     """
     lines: list[str] = []
     if not metrics.ladder:
@@ -648,7 +714,11 @@ def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[pa
 
 
 def _identifiability(report: DynamicReport) -> list[str]:
-    """Return sentences on parameters that are not distinguishable from zero, and on whether the residuals are white."""
+    """Return sentences on parameters that are not distinguishable from zero, and on whether the residuals are white.
+
+    Args:
+        report: stored results of the identification.
+    """
     lines = []
     weak = [row.name for row in report.estimate if row.rsd is not None and row.rsd > MAX_RSD]
     if weak:

@@ -194,8 +194,7 @@ def drift_of(chain: Chain, later: PoseMeasurements, first: Sequence[PoseMeasurem
 def trends(
     chain: Chain, blocks: Sequence[PoseMeasurements], again: Sequence[PoseMeasurements] = (), sigma: float = 0.0
 ) -> list[Trend]:
-    """Return the target's motion with time and with each temperature in the files; an empty list without repeated
-    poses.
+    """Return the target's motion with time and with each temperature in the files; empty without repeated poses.
 
     Args:
         chain: the nominal arm.
@@ -231,7 +230,7 @@ def trends(
 
 
 def _poses(key: np.ndarray) -> np.ndarray:
-    """Return for each row the index (m,) of the first row with nearly the same pose.
+    """Return for each row the index (m,) of the first row with the same pose, up to a difference of `SAME`.
 
     Args:
         key: (m, k) joint values, and scaled indices of target and station.
@@ -240,7 +239,13 @@ def _poses(key: np.ndarray) -> np.ndarray:
 
 
 def _one_clock(times: Sequence[np.ndarray]) -> bool:
-    """Return whether the time ranges of files do not overlap; they overlap if each file counts from its own start."""
+    """Return whether the time ranges of files do not overlap, so that the files can have one clock.
+
+    They overlap if each file counts from its own start.
+
+    Args:
+        times: times of the rows of each file [s].
+    """
     spans = sorted((each.min(), each.max()) for each in times)
     return all(one[1] <= two[0] for one, two in pairwise(spans))
 
@@ -263,8 +268,7 @@ def _trend(what: str, unit: str, x: np.ndarray, off: np.ndarray, pose: np.ndarra
 
 
 def _columns(path: Path, rows: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
-    """Return time [h] and temperatures [°C] of a file's rows: column name -> unit and values (m,); empty without
-    columns.
+    """Return time [h] and temperatures [°C] of a file's rows: column name -> unit and values (m,).
 
     Args:
         path: the file.
@@ -285,7 +289,12 @@ def _covariates(table: Table) -> Iterator[tuple[str, str, np.ndarray]]:
 
 
 def _seconds(cells: np.ndarray, unit: str) -> np.ndarray | None:
-    """Return the times [s] in a column: numbers in a unit of `TIMES`, or dates in ISO 8601; None for other columns."""
+    """Return the times [s] in a column: numbers in a unit of `TIMES`, or dates in ISO 8601; None for other columns.
+
+    Args:
+        cells: (m,) cells of the column.
+        unit: unit in the column's header.
+    """
     if cells.dtype == float:
         return TIMES[unit] * cells if unit in TIMES and np.isfinite(cells).all() else None
     try:

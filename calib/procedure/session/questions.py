@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.config import described, parse
 from calib.config_types import OneOf, ParsedTable, Real
+from calib.controllers.table import controller_named
 from calib.data.images.board import read_board
 from calib.data.images.lens import read_lens
 from calib.data.poses import BOARD, IMAGES, IN_HAND, TO_HAND
@@ -179,6 +180,8 @@ def with_answer(answers: Answers, question: Question, text: str) -> Answers:
         case "dynamics" | "details":
             value = {"y": True, "n": False}.get(text[:1].lower(), text)
     result = replace(answers, **{name: getattr(parse(Answers, {name: value}, ""), name)})
+    if name == "program" and not is_empty:
+        controller_named(text)
     if name == "robot":
         require(text, "a robot is needed: a file, or a robot of the library", UsageError)
         resolve(text)
@@ -228,7 +231,7 @@ def checked(answers: Answers) -> FieldValues:
         if answers.cell:
             first = next(iter(answers.cell))
             option = first.replace("_", "-").replace("obstacles", "obstacle")
-            raise UsageError(f"--{option} and --limits both describe the cell; put it into {answers.limits}")
+            raise UsageError(f"--{option} and --limits both describe the cell; state it in {answers.limits} only")
 
     optional = {
         "payloads": stated_payloads(answers.payloads),
@@ -249,6 +252,9 @@ def checked(answers: Answers) -> FieldValues:
 
 def stated_payloads(texts: Sequence[str]) -> dict[str, dict[str, object]]:
     """Return the payloads of a session by label, from answers such as ``loaded=3.28 at 0,0,0.05``.
+
+    Args:
+        texts: the answers, each ``label``, ``label=kg`` or ``label=kg at x,y,z``.
 
     Raises:
         UsageError: for an invalid answer, or a label that is stated twice.
@@ -273,7 +279,11 @@ def _joint_tolerances(text: str) -> list[float]:
 
 
 def _payload(text: str) -> tuple[str, dict[str, object]]:
-    """Return label and keys of a payload, given as ``label``, ``label=kg`` or ``label=kg at x,y,z``."""
+    """Return label and keys of a payload.
+
+    Args:
+        text: ``label``, ``label=kg`` or ``label=kg at x,y,z`` with the centre of mass in the tip's frame [m].
+    """
     labelled_mass, _, position = text.partition(" at ")
     label, equals, mass = (part.strip() for part in labelled_mass.partition("="))
     payload: dict[str, object] = {}
@@ -365,7 +375,10 @@ def _direction(text: str) -> str | list[float]:
 
 
 def _box(text: str) -> list[list[float]]:
-    """Return the ranges along x, y and z of a box around the robot [m], given as ``x,x,y,y,z,z``.
+    """Return the ranges along x, y and z of a box around the robot [m].
+
+    Args:
+        text: the answer, ``x,x,y,y,z,z``.
 
     Raises:
         ValueError: for another form, or if the base is outside the box.
@@ -455,7 +468,7 @@ def _turned(name: str, most: float, text: str, answers: dict[str, str]) -> dict[
 
 
 def _cone(text: str) -> str:
-    """Return the half angle of a cone with its unit; an angle without a unit is in degrees."""
+    """Return the half angle `text` of a cone with its unit; an angle without a unit is in degrees."""
     return text if any(map(str.isalpha, text)) else f"{text} deg"
 
 

@@ -282,7 +282,7 @@ class SessionSettings:
 
 
 def read_settings(path: Path) -> SessionSettings:
-    """Read ``session.toml``; missing keys get their defaults, and files of schema 1 get no dynamics.
+    """Read ``session.toml`` at `path`; missing keys get their defaults, and files of schema 1 get no dynamics.
 
     Raises:
         SessionError: if the file was made by a newer version, is damaged, or has an invalid value.
@@ -334,7 +334,12 @@ def written(settings: SessionSettings) -> str:
 
 
 def _lines(section: "DataclassInstance | type[DataclassInstance]", prefix: str = "") -> Iterator[str]:
-    """Yield the lines of a section: first keys with comments aligned in one column, then tables."""
+    """Yield the lines of a section: first keys with comments aligned in one column, then tables.
+
+    Args:
+        section: the section, or its class for the default values.
+        prefix: names of the sections that contain it, each followed by a dot; empty: none.
+    """
     comments = described(type(section))
     tables = []
     for key in fields(section):

@@ -47,7 +47,7 @@ class ChangePart(ABC):
     @property
     @abstractmethod
     def today(self) -> float:
-        """The robot's error today if it used the earlier parameters, in the unit of the tolerance."""
+        """The robot's error if it still used the earlier parameters today, in the unit of the tolerance."""
 
     @property
     @abstractmethod
@@ -71,7 +71,7 @@ class ChangePart(ABC):
 
     @abstractmethod
     def shown(self, value: float) -> str:
-        """Return an error as text with its unit."""
+        """Return `value`, an error in the unit of the tolerance, as text with its unit."""
 
     @abstractmethod
     def numbers(self) -> dict[str, object]:

@@ -98,6 +98,9 @@ class Identified:
 def read_models(before: Place, after: Place) -> tuple[Identified, Identified]:
     """Return two identified models of one robot, each read from its folder.
 
+    Args:
+        before, after: sources of the earlier and of the later model.
+
     Raises:
         UsageError: the torques are of different kinds or units.
         RobotError: the models are of different robots.
@@ -167,6 +170,10 @@ def read_states(path: Path, joints: int) -> MotionStates | None:
     """Return the states of a motion from a table; None if the table lacks positions, velocities or accelerations.
 
     Columns ``measured_…`` are the torques, if there are any.
+
+    Args:
+        path: CSV file with columns ``q_…``, ``v_…``, ``a_…``.
+        joints: number of joints.
 
     Raises:
         UsageError: a number of joints other than `joints`.

@@ -109,6 +109,10 @@ class RobotChange(ChartedResult, ReportedResult):
         """Write the comparison into a folder and return its path.
 
         The folder contains report.html, tables of all parameters, metrics.json, and the figures as PNG.
+
+        Args:
+            out: the folder.
+            plots: whether figures are drawn.
         """
         parts = []
         for part in self.parts:
@@ -154,7 +158,8 @@ def diff(before: Compared, after: Compared, settings: DiffSettings = DEFAULT_DIF
         before, after: fits, identifications, their folders, or folders of sessions. Geometry and dynamics are compared
             where both calibrations contain them. One of the two may be the nominal robot (file or name), for a
             comparison of geometry with a fit.
-        settings: tolerances, whether changes of base and tool placement count, further motions.
+        settings: tolerances, whether changes of base and tool placement count, and files of motions along which the
+            change of the torque is computed.
 
     Returns:
         ``verdict``, ``geometry`` with the test and the tool's motion, ``dynamics`` with the test and the change of the

@@ -134,7 +134,11 @@ class ToolPart(ChangePart):
         return lines
 
     def _worst_joints(self, motion: ToolMotion) -> str:
-        """Return as text the joint values at the pose where the target moved most."""
+        """Return as text the joint values at the pose where the target moved most.
+
+        Args:
+            motion: motion of the target at several poses.
+        """
         values = []
         for joint, value in zip(self.before.chain.joints, motion.q[motion.position.argmax()]):
             factor, unit = JOINT[joint.kind]

@@ -184,7 +184,11 @@ class TorquePart(ChangePart):
 
 
 def _unexplained_before(change: TorqueChange) -> float:
-    """Return the share of the torque [%] that the earlier model leaves unexplained; 0 where no torque was measured."""
+    """Return the share of the torque [%] that the earlier model leaves unexplained; 0 where no torque was measured.
+
+    Args:
+        change: change of the torque along one motion.
+    """
     if change.unexplained is None:
         return 0.0
     return change.unexplained[0]
