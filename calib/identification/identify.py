@@ -24,7 +24,6 @@ from calib.identification.friction.ripple import Ripple, find_all
 from calib.identification.loop import LoopResults, per_joint
 from calib.identification.methods.least_squares import LeastSquares
 from calib.identification.methods.method import IdentificationProblem, Method, MethodEstimate
-from calib.identification.methods.recording_noise import with_precision
 from calib.identification.prediction import Dynamics, Model, predict
 from calib.identification.prior import TEMPERING, FirstFit, Prior, find_prior, first_fit, rods, tempered_prior
 from calib.identification.registry import METHODS, method_named
@@ -203,10 +202,6 @@ def identify_model(
         if error_as_moving < CLEARLY_LESS**2 * error:
             rows, prior, first = as_moving
             marks_standstills = False
-    if prior is not None and noise is None:
-        weighed = with_precision(rows, first.std, first.inflation, prior=prior.rows)
-        if any((part.precision != 1.0).any() for part in weighed):
-            rows, prior, first = _first_fit(weighed, find, takes_prior, noise)
     if prior is not None:
         prior = tempered_prior(find, prior, rows, regimes(rows, cases, decimator))
         first = prior.first
@@ -223,10 +218,6 @@ def identify_model(
         richer_rows = _weighed_after_standstills(
             richer_rows, cases, decimator, model.torque_rows, first, prior, column_groups
         )
-    if prior is not None and noise is None:
-        inflation = prior.tempering * first.inflation
-        prior_rows = prior.widened(len(groups))
-        richer_rows = with_precision(richer_rows, first.std, inflation, column_groups, prior_rows)
     breakaway = any((part.breakaway < 1.0).any() for part in richer_rows)
     if prior is not None and (friction.terms or breakaway):
         say("sizes beside richer friction")

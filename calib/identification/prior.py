@@ -348,7 +348,7 @@ def scaled(noise: np.ndarray | None, std: np.ndarray, counts: np.ndarray) -> np.
 def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) -> np.ndarray:
     """Return the variance inflation of each torque row's residuals in motion (rows,).
 
-    It is the integrated autocorrelation, averaged over the cases by the squares of their residuals.
+    It is the integrated autocorrelation, averaged over the cases by their number of residuals.
 
     Args:
         all_rows: rows of all recordings.
@@ -362,11 +362,10 @@ def residual_inflation(all_rows: Sequence[ObservationRows], values: np.ndarray) 
         moves = rows.standing == 0.0
         has_motion = rows.present.any(axis=0) & moves.any(axis=0)
         for row in np.flatnonzero(has_motion):
-            in_motion = residual[moves[:, row], row] * rows.precision[row]
-            squares = float(np.sum(in_motion**2))
-            total[row] += squares * inflation(in_motion)
-            weight[row] += squares
-    return np.maximum(total / np.maximum(weight, 1e-300), 1.0)
+            in_motion = residual[moves[:, row], row]
+            total[row] += len(in_motion) * inflation(in_motion)
+            weight[row] += len(in_motion)
+    return np.maximum(total / np.maximum(weight, 1.0), 1.0)
 
 
 def _shared_directions(model: RegressorModel, robot: np.ndarray, effort: np.ndarray | None) -> np.ndarray:

@@ -174,7 +174,6 @@ class ObservationRows:
             decays.
         rest: weights of standstills.
         coulomb: (rows, p) mask of columns that are Coulomb friction of a torque row.
-        precision: (rows,) factor of all rows of a recording, see `calib.identification.methods.recording_noise`.
     """
 
     names: tuple[str, ...]
@@ -189,13 +188,12 @@ class ObservationRows:
     breakaway: np.ndarray
     rest: RestWeights
     coulomb: np.ndarray
-    precision: np.ndarray
 
     @property
     def weight(self) -> np.ndarray:
         """Factor (M, rows) by which rows are multiplied in estimates: 1 in motion, less at rest, 0 if not used."""
         at_rest = np.sqrt(self._frictions * self.rest.worth)
-        return np.where(self.standing > 0.0, at_rest, self.breakaway) * self.precision * self.present
+        return np.where(self.standing > 0.0, at_rest, self.breakaway) * self.present
 
     @property
     def counted(self) -> np.ndarray:
@@ -207,13 +205,6 @@ class ObservationRows:
     def _frictions(self) -> np.ndarray:
         """Number of values of the friction at rest that each row represents (M, rows); 0 in motion."""
         return self.standing * (1.0 + self.swing / self.rest.reach)
-
-    @property
-    def weighted(self) -> np.ndarray:
-        """Return the mask (rows,) of torque rows that have other weights than 1."""
-        rests = self.standing.any(axis=0)
-        fades = (self.breakaway < 1.0).any(axis=0)
-        return rests | fades | (self.precision != 1.0)
 
     def by_recording(self, recording: int, count: int) -> ObservationRows:
         """Return the rows with separate torque rows for each of `count` recordings, which are then weighted separately.
@@ -238,7 +229,6 @@ class ObservationRows:
             breakaway=breakaway,
             rest=_no_rest(count),
             coulomb=coulomb,
-            precision=np.repeat(self.precision, count),
         )
 
     def extend(self, terms: Sequence[DriveTerm], columns: np.ndarray) -> ObservationRows:
@@ -333,7 +323,6 @@ def observe(model: RegressorModel, columns: np.ndarray, case: Case, decimator: D
         breakaway=breakaway,
         rest=_no_rest(model.rows),
         coulomb=coulomb,
-        precision=np.ones(model.rows),
     )
 
 
@@ -459,7 +448,7 @@ def triangulate(all_rows: Sequence[ObservationRows]) -> Triangles:
             group = block[present] * row_count + row
             matrix = rows.matrix[present, row]
             target = rows.target[present, row]
-            if rows.weighted[row]:
+            if rows.standing[:, row].any() or (rows.breakaway[:, row] < 1.0).any():
                 weight = rows.weight[present, row]
                 matrix = matrix * weight[:, None]
                 target = target * weight

@@ -242,12 +242,10 @@ def divided(all_rows: Sequence[ObservationRows]) -> DividedRows:
             share = part.standing[:, row]
             rests = part.present[:, row] & (share > 0.0)
             moves = part.present[:, row] & (share == 0.0)
-            precision = part.precision[row]
-            weight = part.breakaway[moves, row] * precision
+            weight = part.breakaway[moves, row]
             in_motion = part.matrix[moves, row] * weight[:, None]
             moving = absorb(moving, in_motion, part.target[moves, row] * weight, row)
-            matrix = part.matrix[rests, row] * precision
-            target = part.target[rests, row] * precision
+            matrix, target = part.matrix[rests, row], part.target[rests, row]
             ranges = share[rests] * part.swing[rests, row]
             root, wider = np.sqrt(share[rests]), np.sqrt(ranges)
             standing = absorb(standing, matrix * root[:, None], target * root, row)

@@ -253,31 +253,6 @@ def estimate(
     return _regularised(whitened.T @ whitened, row_count, group, _kinds(group, data.units))
 
 
-def covariance_root(
-    data: Triangles, std: np.ndarray, inflation: np.ndarray, ridges: np.ndarray, prior: np.ndarray | None = None
-) -> np.ndarray:
-    """Return a root (p, k) of the covariance of values estimated with ridges (p,), as `estimate` returns them.
-
-    Columns that a ridge has switched off have no variance.
-    """
-    # Inverted in units of a diagonal of 1.
-    active = np.flatnonzero(ridges > 0.0)
-    weight = 1.0 / (std * np.sqrt(inflation))
-    whitened = data.factors[:, :, :-1] * weight[:, None, None]
-    whitened = whitened.reshape(-1, len(ridges))
-    if prior is not None:
-        whitened = np.vstack([whitened, prior[:, :-1]])
-    square = whitened.T @ whitened
-    prior_information = np.diag(ridges[active] ** -2.0)
-    information = square[np.ix_(active, active)] + prior_information
-    unit = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-    eigenvalues, vectors = np.linalg.eigh(information * np.outer(unit, unit))
-    root = np.zeros((len(ridges), len(active)))
-    size = np.sqrt(np.maximum(eigenvalues, 1e-10))
-    root[active] = unit[:, None] * vectors / size
-    return root
-
-
 def _kinds(group: np.ndarray, units: Sequence[str]) -> np.ndarray:
     """Return a number (p,) that is equal for columns of the same group and unit; -1 for columns without a group."""
     distinct, unit = np.unique(units, return_inverse=True)

@@ -300,7 +300,22 @@ def _estimate(identification: Identification, data: Triangles, blocks: Sequence[
     pooled = pool(data, rows, blocks)
     values, ridges = time_folds.estimate(pooled, fitted.std, fitted.inflation, group, tempered_rows)
 
-    return values, time_folds.covariance_root(pooled, fitted.std, fitted.inflation, ridges, prior_rows)
+    # The covariance of the columns that no ridge has switched off, inverted in units of a diagonal of 1.
+    active = np.flatnonzero(ridges > 0.0)
+    weight = 1.0 / (fitted.std * np.sqrt(fitted.inflation))
+    whitened = pooled.factors[:, :, :-1] * weight[:, None, None]
+    whitened = whitened.reshape(-1, len(group))
+    if prior_rows is not None:
+        whitened = np.vstack([whitened, prior_rows[:, :-1]])
+    square = whitened.T @ whitened
+    prior_information = np.diag(ridges[active] ** -2.0)
+    information = square[np.ix_(active, active)] + prior_information
+    unit = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    eigenvalues, vectors = np.linalg.eigh(information * np.outer(unit, unit))
+    root = np.zeros((len(group), len(active)))
+    size = np.sqrt(np.maximum(eigenvalues, 1e-10))
+    root[active] = unit[:, None] * vectors / size
+    return values, root
 
 
 def _coulomb_friction(identification: Identification) -> np.ndarray:

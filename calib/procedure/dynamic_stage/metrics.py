@@ -21,10 +21,10 @@ from calib.identification.gains import GainRecord
 from calib.identification.identify import Identification
 from calib.identification.loop import LoopMetrics, Replay
 from calib.identification.methods.constraint_settings import Binding
-from calib.identification.methods.recording_noise import error_growth
 from calib.identification.prediction import Score, relative_error_sigma
 from calib.identification.registry import METHODS
 from calib.identification.rows import Case
+from calib.identification.uncertainty.error_growth import error_growth
 from calib.procedure.dynamic_stage import geometry_tables
 from calib.procedure.dynamic_stage.identify import DynamicsAssessment, IdentificationOutcome, ModelFindings
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs

@@ -16,7 +16,7 @@ models. It is taken from the limits file ([noise]), or assumed as a share of the
 `DEFAULT_NOISE`). All predicted σ except the geometry's part are proportional to it.
 
 After an identification, σ_j² is the spectral density of the errors that it left. Its share that grew with the torques'
-rates of change is scaled by the torques' variance on the new motion (`calib.identification.methods.recording_noise`).
+rates of change is scaled by the torques' variance on the new motion (`calib.identification.uncertainty.error_growth`).
 """
 
 from collections.abc import Callable, Sequence

@@ -11,7 +11,7 @@ from calib.dynamics.base import information
 from calib.errors import UsageError
 from calib.folders import COVARIANCE
 from calib.identification.identify_options import FileSettings
-from calib.identification.methods.recording_noise import ErrorGrowth
+from calib.identification.uncertainty.error_growth import ErrorGrowth
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.geometry_tables import TORQUE_COVARIANCE
 from calib.procedure.dynamic_stage.inputs import read_motion
