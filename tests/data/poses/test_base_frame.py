@@ -3,8 +3,9 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from calib.data.poses.base_frame import relative_to_base
 from calib.data.poses.measurements import Poses
-from calib.data.poses.pose_files import read_measurements, relative_to_base
+from calib.data.poses.pose_files import read_measurements
 from calib.transforms import from_quaternion, invert, to_quaternion
 
 
