@@ -19,6 +19,9 @@ from calib.data.schema import refuse
 TARGET_TIMES = (*TIME.names, "t")
 # number of last rows without a base frame, all others having one, that are a column of another length (our choice)
 MIN_SHORTER = 2
+OTHER_ROWS = (
+    "were base frames recorded at other rows? Put each one into the row of its target (calib join by name or time)"
+)
 
 
 def rows_with_base(sheet: Sheet, layout: Layout) -> tuple[Sheet, tuple[str, ...]]:
@@ -42,6 +45,7 @@ def rows_with_base(sheet: Sheet, layout: Layout) -> tuple[Sheet, tuple[str, ...]
     refuse(table, partial, layout.base, lambda row, k: message)
     if missing.all():
         sheet.fail("the base frame was measured in no row", layout.base[0])
+    _refuse_longer(sheet, layout, missing)
     _refuse_shorter(sheet, layout, missing)
     _refuse_other_clock(sheet)
     if not missing.any():
@@ -50,6 +54,20 @@ def rows_with_base(sheet: Sheet, layout: Layout) -> tuple[Sheet, tuple[str, ...]
     more = ", …" if missing.sum() > 6 else ""
     note = f"base frame not measured in {missing.sum()} of {len(table)} rows, which are left out: {rows}{more}"
     return replace(sheet, table=table.where(~missing)), (note,)
+
+
+def _refuse_longer(sheet: Sheet, layout: Layout, missing: np.ndarray) -> None:
+    """Raise MeasurementError for rows with a base frame and without joint values: a column of another length.
+
+    Args:
+        sheet: the table with its options.
+        layout: the columns to read.
+        missing: (m,) rows without a base frame.
+    """
+    joints = np.column_stack(sheet.table.check(layout.joints, layout.joints))
+    alone = np.isnan(joints).all(axis=1) & ~missing
+    message = f"has a base frame and no joint values: {OTHER_ROWS}"
+    refuse(sheet.table, alone, layout.base, lambda row, k: message)
 
 
 def _refuse_shorter(sheet: Sheet, layout: Layout, missing: np.ndarray) -> None:
@@ -65,8 +83,7 @@ def _refuse_shorter(sheet: Sheet, layout: Layout, missing: np.ndarray) -> None:
     if count < MIN_SHORTER or not missing[rows - count :].all():
         return
     sheet.table.fail(
-        f"ends {count} rows before the target: were base frames recorded at other rows? Put each one into the row of "
-        "its target (calib join by name or time); if it was out of sight at the end, remove these rows",
+        f"ends {count} rows before the target: {OTHER_ROWS}; if it was out of sight at the end, remove these rows",
         layout.base[0],
         rows - count,
     )

@@ -25,6 +25,8 @@ from calib.errors import Finding, finding
 MIN_SIGMAS = 3.0
 # rows below which noise and motion are not compared (our choice)
 MIN_ROWS = 5
+# ratio of a spread to its stated σ that no instrument has, but metres under a header of millimetres (our choice)
+MIN_SPREAD = 0.01
 
 
 @dataclass(frozen=True)
@@ -34,12 +36,14 @@ class Spread:
     Attributes:
         rms, largest: lengths of the deviations from the mean.
         noise: rms that noise explains: the smaller one of its two figures.
+        stated: rms that the stated σ explain; 0 if not known.
         exceeds: whether the rms is larger than noise explains.
     """
 
     rms: float
     largest: float
     noise: float
+    stated: float
     exceeds: bool
 
 
@@ -77,6 +81,8 @@ def _judged(file: str, block: Positions, base: np.ndarray, sigma: np.ndarray) ->
     vectors = (turns * turns.mean().inv()).as_rotvec()
     shift = spread_of(base[:, :3], sigma[:, :3])
     turn = spread_of(vectors, sigma[:, 3:])
+    if shift.rms < MIN_SPREAD * shift.stated:
+        return finding("base-frame-quiet", file=file, rows=len(base), rms=shift.rms, noise=shift.stated)
     moved = shift.exceeds or turn.exceeds
     return finding(
         "base-frame-moved" if moved else "base-frame-still",
@@ -104,13 +110,14 @@ def spread_of(values: np.ndarray, sigma: np.ndarray) -> Spread:
     rms = np.sqrt(np.mean(lengths**2))
     share = 1.0 - 1.0 / count
     steps = np.diff(values, axis=0)
-    noises = [np.sqrt(share * np.mean(np.sum(steps**2, axis=1)) / 2.0)]
+    noise = np.sqrt(share * np.mean(np.sum(steps**2, axis=1)) / 2.0)
+    stated = 0.0
     if np.isfinite(sigma).all():
-        noises.append(np.sqrt(share * np.mean(np.sum(sigma**2, axis=1))))
-    noise = min(noises)
+        stated = np.sqrt(share * np.mean(np.sum(sigma**2, axis=1)))
+        noise = min(noise, stated)
     dof = 3 * (count - 1)
     exceeds = rms > (1.0 + MIN_SIGMAS / np.sqrt(2.0 * dof)) * noise
-    return Spread(float(rms), float(lengths.max()), float(noise), bool(exceeds))
+    return Spread(float(rms), float(lengths.max()), float(noise), float(stated), bool(exceeds))
 
 
 def _added_noise(block: Positions) -> float | None:

@@ -36,7 +36,7 @@ from calib.geometry.observability import SIGMA_ORIENTATION, observation, targets
 from calib.identification.model_file import MODEL
 from calib.poses.candidates import draw_candidates
 from calib.poses.space import is_feasible
-from calib.procedure.findings import UNJUDGED, Note, as_notes, lines_of, notes_of
+from calib.procedure.findings import UNJUDGED, Note, as_notes, notes_of
 from calib.procedure.kinematic_stage import fit as fitting
 from calib.procedure.kinematic_stage import folder as outputs
 from calib.procedure.kinematic_stage import inputs, selection
@@ -331,10 +331,10 @@ def notes_on(session: Session, chain: Chain, blocks: Sequence[tuple[str, PoseMea
         elif measures == IMAGES:
             remarks.append("contains no images, although the instrument is a camera; the file is fitted nevertheless")
         remarks += block.notes
-        remarks += lines_of(base_motion([block]))
         if planned is not None:
             remarks += check_against(planned, block)
         notes += [Note(f"{name}: {remark}") for remark in remarks]
+        notes += notes_of(base_motion([block]))
         if planned is not None:
             for note in notes_of(readback(planned, block)):
                 notes.append(Note(f"{name}: {note.text}", note.is_warning))
