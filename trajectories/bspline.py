@@ -132,7 +132,9 @@ def bspline_family(
     """
     counts = counts_of_joints(points, joints)
     if not counts or any(c != 1 and c <= degree for c in counts) or max(counts) == 1:
-        raise BadInput(f"control points {points} for {joints} joints: expected more than the degree {degree} (or 1)")
+        raise BadInput(
+            f"control points {points} for {joints} joints: expected more than the degree {degree}, or 1 to lock a joint"
+        )
     require(degree >= 5, f"degree {degree}: expected 5 or more (below, the jerk is not bounded between samples)")
     require(np.isfinite(period) and period > 0, f"period {period} s: expected a positive number")
     if rate is not None:

@@ -113,22 +113,25 @@ class OpenedRobot:
 
     @cached_property
     def rigid(self) -> list[Leg]:
-        """The legs whose last link is the platform; the first carries it in the tree."""
+        """Legs with a rigid end: their last link is the platform. In the tree the first leg carries the platform."""
         return [leg for leg in self.mechanism.robot.legs if leg.end == "rigid"]
 
     @property
     def closing(self) -> list[Leg]:
-        """The legs that the tree leaves open."""
+        """Legs whose ends the tree does not connect to the platform: the loops that a simulator has to close."""
         return [leg for leg in self.mechanism.robot.legs if leg not in self.rigid[:1]]
 
     @property
     def free(self) -> np.ndarray:
-        """Standard parameters (10,) of a platform that no leg carries in the tree."""
+        """Standard parameters (10,) of the platform without payloads."""
         return self.model.platform_parameters(self.values, ())
 
     @cached_property
     def chains(self) -> list[Chain]:
-        """The legs as chains, uniquely named; the last link of each rigid leg has its share of the platform's mass."""
+        """The legs as chains whose joints have unique names.
+
+        Each of k legs with a rigid end has 1/k of the platform's inertial parameters in its last link.
+        """
         robot = self.mechanism.robot
         rows = self.model.leg_parameters(self.values)
         names = []
@@ -152,7 +155,7 @@ class OpenedRobot:
 
     @property
     def joints(self) -> tuple[Joint, ...]:
-        """All joints of the tree, under their names in the files."""
+        """All joints of the tree, with the names that they have in the exported files."""
         joints: list[Joint] = []
         for chain in self.chains:
             joints += chain.joints
@@ -164,7 +167,7 @@ class OpenedRobot:
 
     @property
     def home(self) -> dict[str, float]:
-        """Values of all joints at which the loops close with the platform at home [rad or m]."""
+        """Values of all joints at home, by name, at which the loops close [rad or m]."""
         names = [joint.name for joint in self.joints]
         values = self.mechanism.home.q[0].tolist()
         return dict(zip(names, values))
@@ -195,7 +198,7 @@ class OpenedRobot:
             ET.SubElement(inertial, "origin", xyz=numbers_text(centre), rpy="0 0 0")
             ET.SubElement(inertial, "mass", value=repr(mass))
             values = [repr(float(moment)) for moment in moments]
-            inertia = dict(zip(INERTIA_KEYS, values))
+            inertia: dict[str, str] = dict(zip(INERTIA_KEYS, values))
             ET.SubElement(inertial, "inertia", inertia)
             add_joint(root, "platform_floating", "floating", "base", PLATFORM, self.mechanism.robot.home)
         for leg in self.closing:
@@ -285,7 +288,13 @@ class OpenedRobot:
 
 @dataclass(frozen=True, eq=False)
 class _Source:
-    """Input of an export: the robot with its dynamics, all parameters as a table, and notes."""
+    """Input of an export.
+
+    Attributes:
+        opened: the robot, cut open, with its dynamics.
+        parameters: content of ``parameters.json``.
+        notes: sentences for the user.
+    """
 
     opened: OpenedRobot
     parameters: dict[str, object]
@@ -294,7 +303,14 @@ class _Source:
 
 @dataclass(frozen=True, eq=False)
 class _ArmBodies:
-    """The bodies of a parallel robot in an arm's form: number of bodies and joints, labels, joint of each body."""
+    """The bodies of a parallel robot in the form of a serial arm's `calib.dynamics.bodies.Bodies`.
+
+    Attributes:
+        count: number of bodies.
+        n: number of joints of all legs.
+        labels: labels of the bodies.
+        coordinates: joint of each body; -1 for payloads.
+    """
 
     count: int
     n: int
@@ -304,7 +320,7 @@ class _ArmBodies:
 
 @dataclass(frozen=True, eq=False)
 class _ArmModel:
-    """The part of an arm's model that `find_possible` reads."""
+    """The attributes of a serial arm's identification model that `find_possible` reads."""
 
     bodies: _ArmBodies
     columns: tuple[object, ...]

@@ -57,7 +57,7 @@ def delivery_text(
             "",
         ]
     if not controller.mastered:
-        lines.append("Its axes are not mastered by their users.")
+        lines.append("Users cannot master the axes of this controller.")
     elif fit_folder is not None and fit_folder.metrics().model == "offsets":
         lines += [
             "Mastering, with frames that belong to it:",

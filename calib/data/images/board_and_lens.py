@@ -211,7 +211,11 @@ def _refine(lens: Lens, table: np.ndarray, pixel: np.ndarray, poses: np.ndarray)
 def _normal(
     lens: Lens, table: np.ndarray, pixel: np.ndarray, visible: np.ndarray, poses: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return ‖r‖² (m,), Jᵀr (m, 6) and JᵀJ (m, 6, 6) of each image; J with respect to the board's twist [v; ω]."""
+    """Return ‖r‖² (m,), Jᵀr (m, 6) and JᵀJ (m, 6, 6) of each image.
+
+    r are the corners' residuals [px], J their derivatives with respect to the board's twist [v; ω]. Arguments as in
+    `_refine`; `visible` (m, K): whether each corner was detected.
+    """
     turned = np.einsum("mij,kj->mki", poses[:, :3, :3], table)
     point = turned + poses[:, None, :3, 3]
     # A poor start may put corners beside or behind the camera, where no lens model applies.
@@ -382,7 +386,13 @@ def _beside_poses(lens: Lens, board: Board, pixel: np.ndarray) -> np.ndarray:
 
 
 def _focal_sigma(lens: Lens, matrix: np.ndarray, rms: float) -> float:
-    """Return the relative σ of the less certain focal length; infinite if it is not identifiable."""
+    """Return the relative σ of that focal length (fx or fy) which is less certain; infinite if it is not identifiable.
+
+    Args:
+        lens: the fitted lens.
+        matrix: (rows, `FITTED`) Jacobian of the lens, poses eliminated.
+        rms: reprojection error [px].
+    """
     size = np.linalg.norm(matrix, axis=0) + 1e-300
     _, values, axes = np.linalg.svd(matrix / size, full_matrices=False)
     if values[-1] < 1e-9 * values[0]:

@@ -41,7 +41,7 @@ RECOMMENDED_SHARE = 0.97
 
 
 def charuco(board: Board) -> cv2.aruco.CharucoBoard:
-    """Return OpenCV's ChArUco board object (lengths in metres)."""
+    """Return a board as OpenCV's ChArUco board object, with lengths in metres."""
     size = board.columns, board.rows
     with quiet():
         return cv2.aruco.CharucoBoard(size, board.square, board.marker, dictionary(board.dictionary))
@@ -99,9 +99,14 @@ def _rectangles(dark: np.ndarray, x: float, y: float, side: float) -> np.ndarray
 
 
 def raster(board: Board, pixels_per_metre: float, margin: float) -> np.ndarray:
-    """Return the image (H, W) of a board with a white margin [m]: reflectances, 0 black to 1 white.
+    """Return the image (H, W) of a printed board as reflectances from 0 (black) to 1 (white).
 
-    Every pixel's value is the white share of its area, so that edges are exact to sub-pixels.
+    The value of a pixel is the white share of its area, so that edges are exact to sub-pixels.
+
+    Args:
+        board: the board.
+        pixels_per_metre: resolution of the image.
+        margin: width of the white margin around the pattern [m].
     """
     extent = np.array(board.extent) + 2.0 * margin
     width = round(float(extent[0]) * pixels_per_metre)

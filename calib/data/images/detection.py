@@ -1,8 +1,8 @@
 """Sub-pixel corner detection: a board's corners in an image with their σ, or the reason why it is unusable.
 
-Markers are found in an image of some `max_pixels` pixels; corners are then refined in the full one by the orthogonality
-of gradients (Förstner & Gülch 1987; OpenCV's cornerSubPix). A corner's standard deviation is the Cramér–Rao bound of
-its patch, n² (Σ g gᵀ)⁻¹ with grey-level noise n and gradients g, with a lower bound.
+Markers are detected in an image reduced to about `MAX_PIXELS` pixels. Corners are then refined in the full image by the
+orthogonality of gradients (Förstner & Gülch 1987; OpenCV's cornerSubPix). The variance of a corner is the Cramér–Rao
+bound of the patch around it, n² (Σ g gᵀ)⁻¹ with grey-level noise n and gradients g; it is at least `FLOOR`².
 """
 
 from collections import Counter
@@ -100,7 +100,7 @@ def detect(image: np.ndarray, board: Board, thorough: bool = True) -> Detection:
 
 
 def _coarse(image: np.ndarray, board: Board) -> tuple[np.ndarray, np.ndarray]:
-    """Return the numbers (n,) and pixels (n, 2) of the detected corners, before refinement."""
+    """Return the numbers (n,) of the detected corners in the board's table, and their pixels (n, 2), not refined."""
     nothing = np.zeros(0, dtype=int), np.zeros((0, 2))
     if board.kind == "chessboard":
         columns = board.columns - 1
@@ -157,7 +157,17 @@ def _upright(image: np.ndarray, pixels: np.ndarray, board: Board) -> np.ndarray:
 def _consistent(
     ids: np.ndarray, pixels: np.ndarray, table: np.ndarray, board: Board
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return numbers (n,) and pixels (n, 2) of the corners consistent with a plane, and the side of a square [px]."""
+    """Return the corners that are consistent with a flat board, and the side of a square.
+
+    Args:
+        ids: (n,) numbers of the detected corners.
+        pixels: (n, 2) pixels of the detected corners.
+        table: (K, 3) positions of all corners of the board [m].
+        board: the board.
+
+    Returns:
+        Numbers and pixels of the consistent corners, and the 20 % quantile of the squares' sides [px].
+    """
     points = table[ids, None, :2]
     plane, _ = cv2.findHomography(points[:, 0], pixels, cv2.RANSAC, 8.0)
     if plane is None:
@@ -182,7 +192,17 @@ def _consistent(
 def _refined(
     image: np.ndarray, board: Board, ids: np.ndarray, pixels: np.ndarray, spacing: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners refined to sub-pixels; corners at the image's edge or without convergence are dropped."""
+    """Return numbers and pixels of the corners refined to sub-pixels.
+
+    Corners at the image's edge, and corners whose refinement does not converge, are omitted.
+
+    Args:
+        image: (height, width) 8-bit grey.
+        board: the board.
+        ids: (n,) numbers of the corners.
+        pixels: (n, 2) pixels before refinement.
+        spacing: side of a square [px].
+    """
     if board.kind == "charuco":
         # half of the gap between a marker and its square
         free = 0.5 * (1.0 - board.marker / board.square)
@@ -205,7 +225,17 @@ def _refined(
 
 
 def _quality(image: np.ndarray, pixels: np.ndarray, floor: float, spacing: float) -> tuple[np.ndarray, float, float]:
-    """Return each corner's σ (n,) [px], the median edge width [px], and its ratio between the two directions."""
+    """Return the σ of each corner (n,) [px], and two measures of blur.
+
+    Args:
+        image: (height, width) 8-bit grey.
+        pixels: (n, 2) refined corners.
+        floor: lower bound of σ [px].
+        spacing: side of a square [px].
+
+    Returns:
+        σ of each corner, median width of the edges [px], and median ratio of the widths of a corner's two edges.
+    """
     half = int(np.clip(0.15 * spacing, 3, MAX_HALF_WIDTH))
     offsets = np.arange(-half, half + 1)
     middle = np.round(pixels).astype(int)
@@ -364,9 +394,10 @@ def detected(
         if progress:
             progress(number, count, name)
         try:
-            image = source
             if isinstance(source, Path):
                 image = read_image(source)
+            else:
+                image = source
         except MeasurementError as error:
             problem = str(error).removeprefix(f"{source}: ")
             detections[name] = Detection(blank, blank[:, 0], problem)

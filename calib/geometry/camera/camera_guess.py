@@ -1,7 +1,8 @@
 """Initial values for a fit of images: lens, mounting (camera or board on the arm), placements of camera and board.
 
-Each image gives the board's pose from its corners alone (`calib.data.images.board_and_lens`); with the arm's poses a
-closed form places camera and board (`calib.geometry.camera.robust_placement`). Both ways of mounting are tried.
+The board's pose in the camera's frame is computed from the corners of each image (`calib.data.images.board_and_lens`).
+From these poses and the arm's poses a closed form gives the placements of camera and board
+(`calib.geometry.camera.robust_placement`). If the mounting is unknown, both mountings are tried.
 """
 
 from collections.abc import Sequence
@@ -119,8 +120,9 @@ def complete_camera(chain: Chain, block: Pixels, fitted_blocks: Sequence[PoseMea
 
 
 def _with_fitted_lens(block: Pixels, fitted_blocks: Sequence[PoseMeasurements]) -> Pixels:
-    """Return the block with the lens of the first fitted block with images of its size; unchanged if there is no such
-    block.
+    """Return the block with the lens of the first fitted block whose images have the same size.
+
+    Without such a fitted block, the block is returned unchanged.
     """
     for fitted in fitted_blocks:
         if isinstance(fitted, Pixels) and fitted.size == block.size and fitted.lens is not None:
@@ -398,7 +400,9 @@ def _check_square(block: Pixels, arm: np.ndarray, placement: CameraPlacement) ->
 
 
 def optics_of(measured: Sequence[Pixels]) -> Optics:
-    """Return the lenses and boards of all image blocks; a camera's lens is that of its first block.
+    """Return the lenses and boards of all image blocks.
+
+    If several blocks are of one camera, the lens of the first block is used.
 
     Raises:
         MeasurementError: if a block's camera is not known, or one camera has images of two sizes.

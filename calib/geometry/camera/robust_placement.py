@@ -4,7 +4,8 @@
 * Li, Wang & Wu (2010): rotations and translations at once, S⁻¹ B_i = A_i X as one homogeneous linear system;
 * Park & Martin (1994): AX = XB of the motions between images for X, then S as the mean over the images.
 
-The best solution has the smallest median misfit. Images that contradict the others are removed, a few times over.
+The best solution is that with the smallest median misfit. Each method is repeated without the images with the largest
+misfits (`ROUNDS`).
 """
 
 from collections.abc import Callable

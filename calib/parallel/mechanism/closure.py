@@ -30,7 +30,12 @@ from calib.records import frozen, shaped
 
 @dataclass(frozen=True, eq=False)
 class Posture:
-    """N solutions: joints of the whole tree q (N, n_t) [rad or m], and poses of the platform (N, 4, 4)."""
+    """N postures of a robot.
+
+    Attributes:
+        q: (N, n_t) values of all joints of all legs [rad or m], leg after leg.
+        pose: (N, 4, 4) poses of the platform in the base.
+    """
 
     q: np.ndarray
     pose: np.ndarray
@@ -187,8 +192,14 @@ class ClosedRobot:
         return _reached(self, readings, at_home, _from_readings, start)
 
     def place(self, coordinates: np.ndarray, start: Posture | None = None) -> Posture:
-        """Return the postures at platform coordinates (N, r) [m, rad] relative to home; arguments and errors as in
-        `locate`.
+        """Return the postures for given coordinates of the platform.
+
+        Args:
+            coordinates: (N, r) coordinates relative to home [m, rad].
+            start: as in `locate`.
+
+        Raises:
+            NoPosture: for samples out of reach, or at or beyond a singularity.
         """
         coordinates = shaped(coordinates, (None, self.robot.r), f"platform coordinates of '{self.robot.name}'")
         at_home = np.zeros(self.robot.r)
@@ -291,10 +302,14 @@ def pose_of(mechanism: ClosedRobot, coordinates: np.ndarray) -> np.ndarray:
 def twists(
     mechanism: ClosedRobot, links: Sequence[LegLinks], shifts: Sequence[np.ndarray] | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return D (N, 6, r) and t_0 (N, 6): platform twists t_0 + D v that all legs can follow, v the independent parts.
+    """Return D (N, 6, r) and t_0 (N, 6) such that all legs can follow the platform's twists t_0 + D v.
+
+    v (r,) are the components of the twist that are named as freedoms.
 
     Args:
-        shifts: (N, c) per leg, the right-hand side e in J q̇ = G t - e; None: zero.
+        mechanism: the robot.
+        links: Jacobians and gaps of the legs.
+        shifts: for each leg (N, c), the right-hand side e in J q̇ = G t - e; None: zero.
     """
     robot = mechanism.robot
     count = len(links[0].gap)
@@ -329,7 +344,10 @@ def _across(link: LegLinks) -> np.ndarray:
 
 
 def _reading_rows(mechanism: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
-    """Return J_p^inv (N, n, r), which maps the twist's independent parts to encoder rates (eqs 5, 15; B_p = -1)."""
+    """Return J_p^inv (N, n, r), which maps the independent parts of the platform's twist to rates of the encoders.
+
+    Source: eqs 5 and 15 of Briot, Gautier & Krut (2013) with B_p = -1.
+    """
     D, _ = twists(mechanism, links)
     joints = joint_rates(links, D)
     return joints[:, mechanism.robot.actuated]
@@ -577,7 +595,7 @@ def _rcond(J: np.ndarray, inverse: np.ndarray) -> np.ndarray:
 
 
 def _determinants(mechanism: ClosedRobot, links: Sequence[LegLinks]) -> np.ndarray:
-    """Return the signs (N, L + 1) of the legs' minors, and of the platform's determinant if J_p^inv is square."""
+    """Return signs (N, L + 1) of determinants: of a minor of each leg's Jacobian, and of J_p^inv (0 if not square)."""
     signs = []
     for link, minor in zip(links, mechanism.minors):
         determinant = np.linalg.det(link.jacobian[:, minor])
@@ -638,7 +656,7 @@ def _check_freedom(robot: ParallelRobot, home: Posture, links: Sequence[LegLinks
 
 
 def _motions(rows: np.ndarray) -> str:
-    """Return the names of a twist's components that are nonzero in rows (k, 6)."""
+    """Return, as text, the names of the components of twists (k, 6) that are not zero in all of them."""
     sizes = np.linalg.norm(rows, axis=0)
     names = [name for name, size in zip(COORDINATES, sizes) if size > 1e-6]
     return ", ".join(names) or "none"

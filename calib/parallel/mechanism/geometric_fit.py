@@ -1,8 +1,7 @@
 """Geometric calibration of a parallel robot from its closure: from platform poses, or from redundant encoders alone.
 
     poses       r = q - q(P; g)                 encoders against the legs' joints at the measured pose
-    encoders    r = Nᵀ (q - q(x̂; g))            what n encoders of r freedoms contradict each other by; x̂ fits them
-    best
+    encoders    r = Nᵀ (q - q(x̂; g))            contradictions of redundant encoders, with the best-fitting pose x̂
 
     ∂q/∂g = -J⁺ ∂gap/∂g                         of the closure J δq = G t - gap(g), so no forward kinematics is
                                                 differentiated (self-calibration: Wampler, Hollerbach & Arai 1995)
@@ -94,7 +93,7 @@ class LoopCovariance:
 
     @classmethod
     def fitted(cls, fit: LoopFit) -> LoopCovariance:
-        """Return the covariance of a fit, without the part that is a choice of frames."""
+        """Return the covariance of a fit; directions that are choices of frames have no variance."""
         directions = visible_directions(fit.mechanism, fit.parameters)
         across = directions @ directions.T
         names = tuple(parameter.name for parameter in fit.parameters)

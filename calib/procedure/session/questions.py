@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from calib.config import described, parse
 from calib.config_types import OneOf, ParsedTable, Real
+from calib.controllers.table import controller_named
 from calib.data.images.board import read_board
 from calib.data.images.lens import read_lens
 from calib.data.poses import BOARD, IMAGES, IN_HAND, TO_HAND
@@ -183,6 +184,8 @@ def with_answer(answers: Answers, question: Question, text: str) -> Answers:
         case "dynamics" | "details" | "reference":
             value = {"y": True, "n": False}.get(text[:1].lower(), text)
     result = replace(answers, **{name: getattr(parse(Answers, {name: value}, ""), name)})
+    if name == "program" and not is_empty:
+        controller_named(text)
     if name == "robot":
         require(text, "a robot is needed: a file, or a robot of the library", UsageError)
         resolve(text)
@@ -237,7 +240,7 @@ def checked(answers: Answers) -> FieldValues:
         if answers.cell:
             first = next(iter(answers.cell))
             option = first.replace("_", "-").replace("obstacles", "obstacle")
-            raise UsageError(f"--{option} and --limits both describe the cell; put it into {answers.limits}")
+            raise UsageError(f"--{option} and --limits both describe the cell; state it in {answers.limits} only")
 
     optional = {
         "payloads": stated_payloads(answers.payloads),
