@@ -104,7 +104,7 @@ def index_of_singular_values(s: np.ndarray, index: Index, m: int) -> np.ndarray:
     """Return the observability index from singular values (last axis, largest first).
 
     Args:
-        s: (..., p) singular values.
+        s: (..., p) singular values of the whitened observation matrix W of all poses.
         index: one of "O1" ... "O5", "cond".
         m: number of poses (used by O1).
 
@@ -135,7 +135,12 @@ def has_kinks(index: Index) -> bool:
 
 
 def log_slope(s: np.ndarray, index: Index) -> np.ndarray:
-    """Return ∂ log O / ∂s (p,) at the singular values s (p,), largest first."""
+    """Return ∂ log O / ∂s (p,) at the singular values s (p,), largest first.
+
+    Args:
+        s: (p,) singular values of the whitened observation matrix.
+        index: observability index O, "O1" ... "O5" or "cond".
+    """
     slope = np.zeros_like(s)
     if index == "O1":
         return 1.0 / (len(s) * s)
