@@ -274,7 +274,7 @@ def _interior(
         x: (K,) first weights.
         m: sum of the weights.
         cap: largest weight of a candidate.
-        tolerance: relative gap of log det at which the iteration ends.
+        tolerance: relative gap of det(M)^(1/p) to its optimum at which the iteration ends.
         max_steps: largest number of Newton steps.
     """
     count, _, p = z.shape

@@ -146,7 +146,6 @@ def gains_of(pool: Pool, design: Design, candidates: np.ndarray, sign: float) ->
 
     The change is log det(I ± z_i C z_iᵀ), with the candidate's Jacobian z_i (rows, p) and C = M⁻¹ of the design.
 
-
     Args:
         pool: the candidates.
         design: the design to change.

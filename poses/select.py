@@ -277,8 +277,7 @@ def _candidates(
 
 
 def _exchange(task: _Request) -> _Chosen:
-    """Return the poses of `task` chosen among its candidates by exchange (detmax); after Ctrl-C the best set reached.
-    """
+    """Return the poses of `task` chosen by exchange of candidates (detmax); after Ctrl-C the best set reached."""
     candidates = task.candidates
     m = task.m
     p = task.jacobians.shape[2]

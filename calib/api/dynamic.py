@@ -108,7 +108,12 @@ class DynamicsModel(ChartedResult, ReportedResult, identify.IdentificationOutcom
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the result folder, with the same files as `calib identify --out`, and return its path."""
+        """Write the result folder, with the same files as `calib identify --out`, and return its path.
+
+        Args:
+            out: folder to write; an earlier result of the same kind in it is replaced.
+            plots: whether to write the figures.
+        """
         from calib.procedure.report import outputs
 
         return folder.write_folder(self, Path(out), partial(outputs.write_model, plots=plots))
@@ -180,8 +185,9 @@ def identify_dynamics(
 ) -> DynamicsModel:
     """Return a robot's dynamics, identified on its geometry and judged on motion that was not fitted.
 
-    If the robot is the result of a fit (``fit.robot``), the covariance of its geometry is propagated to the estimate: Σ
-    = Σ_torque + S Σ_geometry Sᵀ, with S the sensitivity of the estimate to the geometry.
+    If the robot is the result of a fit (``fit.robot``), the covariance of its geometry is propagated to the estimate:
+    the covariance Σ of the base parameters is Σ_torque + S Σ_geometry Sᵀ, with Σ_torque due to the errors of the
+    torques and S the sensitivity of the estimate to the geometry.
 
     Args:
         robot, base, tip: arguments of `calib.load`; or, for `robot`, the result of `calib.load` or ``fit.robot``. For a

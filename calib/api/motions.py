@@ -56,6 +56,10 @@ class ExcitationDesign(ChartedResult, WithoutVerdict, design.Designed):
         """Write the result folder, with the same files as `calib excite --out`, and return its path.
 
         The files are trajectory.csv, ROS 2 messages, metrics and figures.
+
+        Args:
+            out: folder to write; an earlier result of the same kind in it is replaced.
+            plots: whether to write the figures.
         """
         from calib.procedure.report import motion_figures
 
@@ -99,7 +103,12 @@ class MotionPlan(ChartedResult, WithoutVerdict, planning.Planned):
 
     @checked
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write the result folder, with the same files as `calib plan --out`, and return its path."""
+        """Write the result folder, with the same files as `calib plan --out`, and return its path.
+
+        Args:
+            out: folder to write; an earlier result of the same kind in it is replaced.
+            plots: whether to write the figures.
+        """
         from calib.procedure.report import motion_figures
 
         write_figures = motion_figures.write_plan if plots else None

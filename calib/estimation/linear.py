@@ -115,6 +115,10 @@ def subsystem_std(data: Triangles) -> np.ndarray:
 
     Kolyubin et al. (2019), after eq. 22.
 
+    Args:
+        data: R factors of [W y], one group g with r_g rows per standard deviation; ρ_g are the group's residuals in
+            units of y.
+
     Raises:
         CalibError: for a group with no more rows than independent columns.
     """
@@ -239,7 +243,7 @@ def leverage(data: Triangles, std: np.ndarray, inverse: np.ndarray) -> np.ndarra
 
     Args:
         data: R factors of [W y].
-        std: (g,) standard deviations σ_g.
+        std: (g,) standard deviations σ_g of the groups, in units of y.
         inverse: (p, p) R⁻¹ of the weighted W.
     """
     whitened = data.factors[:, :, :-1] @ inverse
