@@ -96,7 +96,12 @@ def _in_obstacle_frame(obstacle: Obstacle, points: np.ndarray) -> np.ndarray:
 
 
 def _face_distances(obstacle: Obstacle, local: np.ndarray) -> np.ndarray:
-    """Return the signed distances (..., k) [m] of points (..., 3) in the obstacle's frame from its k faces."""
+    """Return the signed distances (..., k) [m] of points (..., 3) in the obstacle's frame from its k faces.
+
+    Args:
+        obstacle: the obstacle; k depends on its kind.
+        local: the points.
+    """
     if obstacle.kind == "box":
         return np.abs(local) - np.array(obstacle.size) / 2
     radius, length = obstacle.size

@@ -113,7 +113,12 @@ def link_frame(model: NativeModel, link: str) -> int:
 
 
 def driven_joints(model: NativeModel, chain: Chain) -> list[NativeModel]:
-    """Return Pinocchio's joints for the moving elements of a chain, including mimic followers."""
+    """Return Pinocchio's joints for the moving elements of a chain, including mimic followers.
+
+    Args:
+        model: Pinocchio's model of the same robot.
+        chain: the arm.
+    """
     return [model.joints[model.getJointId(joint_name(chain, k))] for k in chain.driven.tolist()]
 
 
@@ -173,6 +178,10 @@ def motion_torques(
 
 def pinocchio_model(source: str, mjcf: bool = False) -> NativeModel:
     """Return Pinocchio's model of a URDF or MJCF text; MJCF is written to a temporary file first.
+
+    Args:
+        source: URDF or MJCF text.
+        mjcf: whether the text is MJCF.
 
     Raises:
         RobotError: Pinocchio cannot read the text.
