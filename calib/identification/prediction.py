@@ -29,6 +29,9 @@ MIN_WHITENESS_SAMPLES = 40
 """Decimated samples above which the whiteness of residuals is tested."""
 MAX_LAGS = 30
 """Lags of the test of whiteness."""
+MAX_PREDICTED_ABOVE = 0.1
+"""Predicted torque above the identification band, in squares over the measured one, up to which there is noise or what
+else no motion explains (our choice)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +109,10 @@ class Score:
         motion_share: share of rows in motion; if small, the test covers mostly friction at rest.
         evidence: False for a repetition of the training motion.
         interval95: coverage of the 95 % intervals; None if the model has no intervals.
+        moving_in_band: errors as in `filtered`, but only of moving joints; None in files of earlier versions.
+        floor_percent: residual above the identification band, 100 ‖r - r_f‖ / ‖τ‖ over all rows [%], if the model
+            predicts next to no torque there; 0 if it predicts some, and in files of earlier versions.
+        band: upper end of the identification band [Hz]; NaN: not filtered, and in files of earlier versions.
     """
 
     raw: PredictionErrors
@@ -119,6 +126,14 @@ class Score:
     motion_share: float
     evidence: bool = True
     interval95: IntervalCoverage | None = None
+    moving_in_band: PredictionErrors | None = None
+    floor_percent: Number = 0.0
+    band: Number = np.nan
+
+    @property
+    def noisy(self) -> bool:
+        """Whether most of the squared error is above the identification band, where the motion predicts no torque."""
+        return 2.0 * self.floor_percent**2 > self.raw.total**2
 
     @property
     def stands(self) -> bool:
@@ -129,9 +144,29 @@ class Score:
     def judged(self) -> PredictionErrors:
         """Errors that the verdict uses: errors of moving joints, or all errors if no joint is at rest.
 
-        Friction at rest is undetermined, so that errors at rest do not count.
+        Friction at rest is undetermined, so that errors at rest do not count. In a `noisy` recording the errors in the
+        identification band count, since those above it say nothing about the model.
         """
-        return self.moving if self.stands else self.raw
+        if not self.noisy:
+            return self.moving if self.stands else self.raw
+        if self.stands and self.moving_in_band is not None:
+            return self.moving_in_band
+        return self.filtered
+
+    def without_floor(self, percent: float) -> float:
+        """Return an unexplained share of the raw torque [%] as this recording is judged: without `floor_percent`.
+
+        Args:
+            percent: unexplained share of the raw torque by another model, such as the exported robot's [%].
+        """
+        if not self.noisy:
+            return percent
+        return float(np.sqrt(max(percent**2 - self.floor_percent**2, 0.0)))
+
+    @property
+    def above_band(self) -> str:
+        """Text on the unexplained share of the torque with all frequencies; empty unless the recording is `noisy`."""
+        return f"{self.raw.total:.2f} %" if self.noisy else ""
 
     @property
     def at_rest(self) -> str:
@@ -181,18 +216,20 @@ def score(
     motion = case.motion
     moves = moving(motion) if slow is None else moving(motion, slow)
     sums = []
+    floors = []
     above = []
     explained = []
     residuals = []
     for row in range(case.target.shape[1]):
         row_moves = moves[:, row % motion.n]
         row_predicted = np.asarray(predicted)[:, row]
-        row_sums, row_above, row_explained, residual = _score_row(case, row_predicted, row, row_moves)
+        row_sums, row_floor, row_above, row_explained, residual = _score_row(case, row_predicted, row, row_moves)
         sums.append(row_sums)
+        floors.append(row_floor)
         above.append(row_above)
         explained.append(row_explained)
         residuals.append(residual)
-    raw, filtered, in_motion, at_rest = np.stack(sums, axis=1)
+    raw, filtered, in_motion, at_rest, in_motion_and_band = np.stack(sums, axis=1)
     step = motion.decimator.factor
     standing = _prediction_errors(at_rest, apart)
     above_band_percent = np.array(above)
@@ -213,12 +250,29 @@ def score(
         whiteness=whiteness,
         rate=rate,
         motion_share=motion_share,
+        moving_in_band=_prediction_errors(in_motion_and_band, apart),
+        floor_percent=_floor_percent(np.array(floors), apart),
+        band=motion.band,
     )
+
+
+def _floor_percent(sums: np.ndarray, apart: Sequence[int]) -> float:
+    """Return `Score.floor_percent` from sums (rows, 4) over the squares above the band and of the torque.
+
+    Args:
+        sums: Σ r², Σ τ² and Σ τ̂² of the residuals, measured and predicted torques above the band; Σ τ² of the torque.
+        apart: rows in a different unit, excluded.
+    """
+    same_unit = ~np.isin(np.arange(len(sums)), apart)
+    residual, measured, predicted, torque = sums[same_unit].sum(axis=0)
+    if not torque or predicted > MAX_PREDICTED_ABOVE * measured:
+        return 0.0
+    return float(100.0 * np.sqrt(residual / torque))
 
 
 def _score_row(
     case: Case, predicted: np.ndarray, row: int, moves: np.ndarray
-) -> tuple[np.ndarray, float, float, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, float, float, np.ndarray]:
     """Return the sums from which a torque row is scored; rows are processed one by one to save memory.
 
     Args:
@@ -228,9 +282,9 @@ def _score_row(
         moves: (N,) mask of samples in which the joint moves.
 
     Returns:
-        an array (4, 3) of Σ (τ - τ̂)², Σ τ² and number of samples, for raw torques, filtered torques, moving joints,
-        and standing joints; `Score.above_band_percent` and `Score.r_squared` of the row; the filtered residual (M,),
-        decimated.
+        an array (5, 3) of Σ (τ - τ̂)², Σ τ² and number of samples, for raw torques, filtered torques, moving joints,
+        standing joints, and filtered torques of moving joints; the sums (4,) of `_floor_percent`;
+        `Score.above_band_percent` and `Score.r_squared` of the row; the filtered residual (M,), decimated.
     """
     motion = case.motion
     valid = motion.weight > 0.5
@@ -242,13 +296,16 @@ def _score_row(
     at_rest = _sums(target, residual, valid & ~moves)
     raw = _sums(target, residual, valid)
     filtered = _sums(target_in_band, residual_in_band, valid)
-    sums = [raw, filtered, in_motion, at_rest]
+    in_motion_and_band = _sums(target_in_band, residual_in_band, valid & moves)
+    sums = [raw, filtered, in_motion, at_rest, in_motion_and_band]
+    above_band = np.stack([residual - residual_in_band, target - target_in_band, predicted - predicted_in_band, target])
+    floor = np.sum(above_band[:, valid] ** 2, axis=1)
     size = float(np.linalg.norm(target))
     above = 0.0
     if size > 0.0:
         above = 100.0 * float(np.linalg.norm(target - target_in_band)) / size
     thinned = residual_in_band[:: motion.decimator.factor]
-    return np.array(sums), above, r_squared(target[valid], residual[valid]), thinned
+    return np.array(sums), floor, above, r_squared(target[valid], residual[valid]), thinned
 
 
 def _sums(target: np.ndarray, residual: np.ndarray, selected: np.ndarray) -> tuple[float, float, float]:

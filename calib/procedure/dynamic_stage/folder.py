@@ -16,7 +16,7 @@ from calib.identification.gains import GainRecord
 from calib.identification.identify import Identification
 from calib.identification.model_file import MODEL, read_dynamics, to_table
 from calib.identification.physical_consistency import information
-from calib.identification.prediction import Dynamics
+from calib.identification.prediction import Dynamics, Score
 from calib.identification.rows import Case
 from calib.identification.uncertainty.torque_errors import TorqueErrorModel, TorqueIntervals, read_uncertainty
 from calib.procedure.dynamic_stage import geometry_tables
@@ -85,7 +85,16 @@ class IdentificationFolder:
 
         Without held-out motion: the table of the first training recording.
         """
-        return sorted(self.unseen.path.glob("torques_*.csv")) or [self.path / "torques_1.csv"]
+        paths = self.unseen.path.glob("torques_*.csv")
+        return sorted(paths, key=_number_of_table) or [self.path / "torques_1.csv"]
+
+    def scores_of_torques(self) -> Sequence[Score | None]:
+        """Read the scores of the model on the recordings of the tables `torques`; None if they are not stored."""
+        if not (self.unseen.report.is_file() or (self.path / folders.REPORT).is_file()):
+            return [None] * len(self.torques)
+        report = self.judged
+        scores = {**report.fit, **report.validation}
+        return [scores[curves.name] for curves in report.curves]
 
     @property
     def unseen(self) -> UnseenFolder:
@@ -126,6 +135,11 @@ class IdentificationFolder:
         if uncertainty is None:
             return None
         return TorqueErrorModel(uncertainty.columns, uncertainty.covariance, discrepancy)
+
+
+def _number_of_table(path: Path) -> int:
+    """Return the number in the name of a table of torques, torques_12.csv."""
+    return int(path.stem.rpartition("_")[2])
 
 
 @dataclass(frozen=True)

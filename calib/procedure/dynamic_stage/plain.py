@@ -132,28 +132,31 @@ def references(
             error = np.nan
             if values is not None and len(values) == len(dynamics.values):
                 predicted = predict(Dynamics(dynamics.model, values), case)
-                error = _unexplained(case, predicted, score.stands, slow, apart)
+                error = _unexplained(case, predicted, score, slow, apart)
             errors.append(error)
         result[case.name] = PlainReferences(score.judged.total, *errors)
     return result
 
 
 def _unexplained(
-    case: Case, predicted: np.ndarray, in_motion: bool, slow: float | tuple[float, ...] | None, apart: Sequence[int]
+    case: Case, predicted: np.ndarray, score: Score, slow: float | tuple[float, ...] | None, apart: Sequence[int]
 ) -> float:
     """Return the unexplained share 100 ‖τ - τ̂‖ / ‖τ‖ [%] of the torques τ of a recording; NaN without torques.
 
-    With `in_motion`, only samples at which the joint moves are counted.
+    Samples and frequencies are those that count in the model's score, see `Score.judged`.
     """
     motion = case.motion
     rows = case.target.shape[1]
+    target = case.target
+    if score.noisy:
+        target, predicted = motion.in_band(target), motion.in_band(predicted)
     counted = np.repeat(motion.weight[:, None] > 0.5, rows, axis=1)
-    if in_motion:
+    if score.stands:
         moves = moving(motion) if slow is None else moving(motion, slow)
         counted &= moves[:, np.arange(rows) % motion.n]
     counted[:, list(apart)] = False
-    residual_squares = float(np.sum((case.target - predicted)[counted] ** 2))
-    squares = float(np.sum(case.target[counted] ** 2))
+    residual_squares = float(np.sum((target - predicted)[counted] ** 2))
+    squares = float(np.sum(target[counted] ** 2))
     return 100.0 * float(np.sqrt(residual_squares / squares)) if squares > 0.0 else np.nan
 
 

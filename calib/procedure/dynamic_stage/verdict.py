@@ -115,7 +115,16 @@ def judge(
     totals.append(training)
     times, most = error / max(training_error, 1e-300), limit("no-torque-transfer", "times", "marginal")
     totals.append(finding("no-torque-transfer", times=times, most=most))
-    figures = finding("torque-errors", unseen=error, file=name, own=training_error, rest=moving[name].at_rest)
+    worst_score = moving[name]
+    figures = finding(
+        "torque-errors",
+        unseen=error,
+        file=name,
+        own=training_error,
+        rest=worst_score.at_rest,
+        band=worst_score.band,
+        all=worst_score.above_band,
+    )
     worst = settle(totals)[:1]
     return sentence(figures), [*worst, *joints]
 

@@ -125,8 +125,10 @@ def exported_prediction(robot: IdentifiedRobot, folder: Path) -> ExportedPredict
     None if the recordings were made with payloads, or if an earlier version did not store their velocities.
     """
     dynamics = without_left(robot.found.dynamics)
+    identification = IdentificationFolder(folder)
+    scores = identification.scores_of_torques()
     worst = None
-    for path in IdentificationFolder(folder).torques:
+    for path, score in zip(identification.torques, scores):
         motion = read_torques(path) if path.is_file() else {}
         if not motion:
             continue
@@ -135,6 +137,8 @@ def exported_prediction(robot: IdentifiedRobot, folder: Path) -> ExportedPredict
         one_percent = np.linalg.norm(measured) / 100.0
         exported = float(np.linalg.norm(measured - torque) / one_percent)
         identified = float(np.linalg.norm(measured - motion["predicted"]) / one_percent)
+        if score is not None:
+            exported, identified = score.without_floor(exported), score.without_floor(identified)
         if worst is None or exported > worst.exported:
             worst = ExportedPrediction(str(path.relative_to(folder)), exported, identified)
     return worst

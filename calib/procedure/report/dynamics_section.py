@@ -277,6 +277,8 @@ def _key_figures(unseen: UnseenReport, tolerance: float, delivered: float | None
     error, in_band = "torque unexplained", "torque unexplained in the motion's band"
     if proof.stands:
         error += " in motion"
+    if proof.noisy:
+        error += f" below {proof.band:.3g} Hz"
     identified = percent(proof.judged.total)
     allowed = f"{tolerance:g} %" if tolerance else "none"
     if delivered is None:
@@ -291,6 +293,8 @@ def _key_figures(unseen: UnseenReport, tolerance: float, delivered: float | None
         ]
     if proof.stands:
         figures.append(page.KeyFigure("torque unexplained at rest", "", percent(proof.standing.total), "", basis))
+    if proof.noisy:
+        figures.append(page.KeyFigure("torque unexplained at all frequencies", "", percent(proof.raw.total), "", basis))
     figures.append(page.KeyFigure(in_band, "", percent(proof.filtered.total), "", basis))
 
     finite = [(share, row) for share, row in zip(proof.filtered.joints, unseen.rows) if np.isfinite(share)]
