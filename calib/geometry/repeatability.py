@@ -197,7 +197,13 @@ class CommandedPose:
 
 
 def _command(cell: Installation, block: Block, rows: np.ndarray) -> CommandedPose:
-    """Return the pose that an arm predicts for the mean joint values of some rows of a block."""
+    """Return the pose that an arm predicts for the mean joint values of some rows of a block.
+
+    Args:
+        cell: the installation of the arm, its station and its tool.
+        block: the prepared measurements.
+        rows: row numbers in the block.
+    """
     seen = predict(cell, rows_of(cell, block, rows))
     rotations = Rotation.from_matrix(seen.rotation.transpose(2, 1, 0))
     return CommandedPose(cell.stations[block.station][:3, :3], seen.point.mean(axis=1), rotations.mean())
@@ -206,7 +212,13 @@ def _command(cell: Installation, block: Block, rows: np.ndarray) -> CommandedPos
 def _repeated_pose(
     measured: Positions, rows: np.ndarray, nominal: CommandedPose, calibrated: CommandedPose
 ) -> RepeatedPose:
-    """Return accuracy and repeatability of one pose from its rows and the pose that each arm predicts."""
+    """Return accuracy and repeatability of one pose from its rows and the pose that each arm predicts.
+
+    Args:
+        measured: the block of measurements.
+        rows: row numbers of the pose's cycles.
+        nominal, calibrated: pose predicted by the nominal and by the calibrated arm.
+    """
     points = measured.position[rows]
     variation = _variation(points, _directions(measured, rows))
     result = RepeatedPose(
@@ -329,13 +341,21 @@ def _marks(block: PoseMeasurements) -> list[bytes]:
     """Return a key for each row: its joint values and measured numbers, rounded to 12 decimals.
 
     Equal rows have equal keys.
+
+    Args:
+        block: the measurements.
     """
     table = np.column_stack([block.q, block.tool.astype(float), block.measured])
     return [row.tobytes() for row in np.round(table, 12) + 0.0]
 
 
 def _row_numbers(block: PoseMeasurements, mask: Sequence[bool] | np.ndarray) -> list[int]:
-    """Return the row numbers in the file of the rows in a mask (m,), each once."""
+    """Return the row numbers in the file of the rows in a mask (m,), each once.
+
+    Args:
+        block: the measurements.
+        mask: (m,) the wanted rows.
+    """
     rows = block.rows[np.array(mask, dtype=bool)]
     return [int(row) for row in dict.fromkeys(rows)]
 

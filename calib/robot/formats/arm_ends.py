@@ -384,7 +384,7 @@ class _Axes:
 
 
 def _follows(before: str, name: str) -> bool:
-    """Return whether `before` and `name` begin alike and then have numbers n and n + 1: ``joint_1_s``, ``joint_2_l``."""
+    """Return whether `before` and `name` begin alike and end in numbers n and n + 1: ``joint_1_s``, ``joint_2_l``."""
     first = NUMBERED.match(before.lower())
     second = NUMBERED.match(name.lower())
     if first is None or second is None:
