@@ -74,6 +74,12 @@ def _clipped(joint: int, t: np.ndarray, q: np.ndarray, torque: np.ndarray) -> Co
     """Return the fault of a torque that repeats its extreme value exactly while its joint moves; None without it.
 
     The joint has to move at various speeds, at which friction would change the torque.
+
+    Args:
+        joint: index of the joint.
+        t: (N,) time stamps [s].
+        q: (N, n) positions [rad or m].
+        torque: (N,) torque or current of the joint.
     """
     speed = np.abs(_speed(t, q))
     peak = float(speed.max())
@@ -99,7 +105,14 @@ def _clipped(joint: int, t: np.ndarray, q: np.ndarray, torque: np.ndarray) -> Co
 
 
 def _standing_position(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> ColumnFault | None:
-    """Return the fault of a position that is constant while the measured velocity integrates to a motion; or None."""
+    """Return the fault of a position that is constant while the measured velocity integrates to a motion; or None.
+
+    Args:
+        joint: index of the joint.
+        t: (N,) time stamps [s].
+        q: (N,) positions of the joint [rad or m].
+        v: (N,) measured velocities of the joint.
+    """
     min_travel = max(MIN_TRAVEL, MIN_STEPS * _resolution(q))
     parts = []
     for first, last in _constant(q):
@@ -112,7 +125,14 @@ def _standing_position(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) 
 
 
 def _standing_velocity(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) -> ColumnFault | None:
-    """Return the fault of a velocity that is constant while the position moves at another speed; or None."""
+    """Return the fault of a velocity that is constant while the position moves at another speed; or None.
+
+    Args:
+        joint: index of the joint.
+        t: (N,) time stamps [s].
+        q: (N,) positions of the joint [rad or m].
+        v: (N,) measured velocities of the joint.
+    """
     parts = []
     for first, last in _constant(v):
         time = t[first:last] - t[first]
@@ -124,7 +144,13 @@ def _standing_velocity(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) 
 
 
 def _jumping(joint: int, t: np.ndarray, q: np.ndarray) -> ColumnFault | None:
-    """Return the fault of a position that is constant during motion, then jumps by about the missed motion; or None."""
+    """Return the fault of a position that is constant during motion, then jumps by about the missed motion; or None.
+
+    Args:
+        joint: index of the joint.
+        t: (N,) time stamps [s].
+        q: (N,) positions of the joint [rad or m].
+    """
     parts = []
     for first, last in _constant(q):
         if first < REACH or last + REACH >= len(q):

@@ -163,6 +163,11 @@ def rows_in_pieces(t: np.ndarray, first: int, stop: int, max_samples: int | None
     position, so that the pieces cover the whole time and are not periodic like the motion. All rows are used if there
     are at most a quarter more than `max_samples`. All are used too if the time stamps t (N,) run backwards, since a
     later check then refuses them with advice on where to cut.
+
+    Args:
+        t: (N,) time stamps of the whole file [s].
+        first, stop: index of the first row, and of the row after the last one.
+        max_samples: largest number of rows; None: no limit.
     """
     count = stop - first
     if max_samples is None or count <= MAX_EXCESS * max_samples:

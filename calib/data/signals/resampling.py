@@ -86,6 +86,10 @@ class SampleClock:
 def find_clock(recording: Recording, kind: str = "auto") -> SampleClock:
     """Return the clock `kind` of a recording; for ``auto``, the clock with the smoothest positions.
 
+    Args:
+        recording: the recording.
+        kind: one of `CLOCKS`, or ``auto``.
+
     Raises:
         UsageError: an unknown clock, or a clock that is not possible for this recording.
     """
@@ -120,6 +124,9 @@ def _read_twice(recording: Recording) -> np.ndarray:
 
     Such a row is the last sample read again because the next one was late. Rows of a robot at rest may be equal, too.
     Therefore only short runs of equal rows between rows of different positions are marked.
+
+    Args:
+        recording: the recording of N samples.
     """
     q_changes = np.asarray(np.diff(recording.q, axis=0).any(axis=1))
     effort_changes = np.asarray(np.diff(recording.effort, axis=0).any(axis=1))
@@ -137,6 +144,9 @@ def _even_times(t: np.ndarray) -> tuple[np.ndarray, float] | None:
     """Return times k T + drift (N,) [s], where k counts lost samples too, and the period T [s].
 
     None if the samples are not even.
+
+    Args:
+        t: (N,) time stamps [s].
     """
     lattice = find_lattice(t, DRIFT_SAMPLES)
     if lattice is not None:
@@ -209,6 +219,10 @@ def _lost(t: np.ndarray, step: float) -> np.ndarray:
     """Return the number of samples lost between successive stamps (N - 1,).
 
     It is the number of whole periods by which all later stamps are late.
+
+    Args:
+        t: (N,) time stamps [s].
+        step: period of the samples [s].
     """
     lost = np.zeros(len(t) - 1)
     delay = t - step * np.arange(len(t))
