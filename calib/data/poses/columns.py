@@ -388,7 +388,7 @@ def _find_orientation(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
 
     Args:
         sheet: the table with its options.
-        joints: the file's names of the joint columns.
+        joints: names of the joint columns, which are not angles of an orientation.
 
     Raises:
         MeasurementError: three angles whose convention the options do not define.
@@ -411,7 +411,7 @@ def _angles(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
 
     Args:
         sheet: the table with its options.
-        joints: the file's names of the joint columns.
+        joints: names of the joint columns, which are not angles of an orientation.
     """
     standard_names = ANGLES[0]
     if any(name in sheet.options.columns for name in standard_names):

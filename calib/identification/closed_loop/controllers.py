@@ -80,8 +80,8 @@ def pd(
     """Return a PD or PID controller.
 
     Args:
-        kp, kd: (n,) gains of position and velocity error.
-        limit: (n,) torque limit, or one number.
+        kp, kd: (n,) gains of position error [N m/rad] and velocity error [N m s/rad]; N and m for a prismatic joint.
+        limit: (n,) torque limit [N m or N], or one number.
         ki: (n,) integral gains, or one number; 0 for a PD controller.
     """
     share = np.asarray(1.0)
@@ -142,7 +142,13 @@ def computed_torque(
 
 
 def completed(controller: LoopController, loop: LoopSettings, n: int) -> LoopController:
-    """Return a controller of n joints with the limits, delay and velocity filter of the settings."""
+    """Return a controller of n joints with the limits, delay and velocity filter of the settings.
+
+    Args:
+        controller: the controller with its gains.
+        loop: settings of the loop.
+        n: number of joints.
+    """
     share = np.full(n, loop.share)
     limit = loop.per_joint("limit", n)
     windup = loop.per_joint("windup", n)
@@ -205,10 +211,10 @@ def identify_controller(
 
     Args:
         reference: reference at any multiple of the log's rate; it starts with the log's first sample.
-        measured, tau: (N, n) logged positions and torques.
+        measured, tau: (N, n) logged positions [rad or m] and torques [N m or N].
         rate: sampling rate of the log [Hz].
         band: cut-off of the low-pass, and highest frequency at which the gains are fitted [Hz].
-        orders: na, nb of the ARX model.
+        orders: na, nb: numbers of past torques and of past position errors in the ARX model.
         integral: whether to identify the integral gains, too.
 
     Raises:
@@ -249,7 +255,13 @@ def _error(reference: Reference, measured: np.ndarray, rate: float) -> np.ndarra
 
 
 def _ticks(reference: Reference, rate: float, count: int) -> np.ndarray:
-    """Return the times (count,) of a log's samples in control periods, as integers where these are within 0.1 %."""
+    """Return the times (count,) of a log's samples in control periods, as integers where these are within 0.1 %.
+
+    Args:
+        reference: reference at the controller's rate.
+        rate: sampling rate of the log [Hz].
+        count: number of the log's samples.
+    """
     every = 1.0 / (rate * reference.period)
     if abs(every / max(round(every), 1) - 1.0) < 1e-3:
         every = round(every)
@@ -257,7 +269,14 @@ def _ticks(reference: Reference, rate: float, count: int) -> np.ndarray:
 
 
 def _instruments(reference: Reference, count: int, rate: float, band: float) -> np.ndarray:
-    """Return low-passed instruments (count, k): functions of the reference like friction, inertia and gravity."""
+    """Return low-passed instruments (count, k): functions of the reference like friction, inertia and gravity.
+
+    Args:
+        reference: reference at the controller's rate.
+        count: number of the log's samples.
+        rate: sampling rate of the log [Hz].
+        band: cut-off of the low-pass [Hz].
+    """
     q, v, a = reference.at(_ticks(reference, rate, count))
     jerk = np.gradient(a, 1.0 / rate, axis=0)
     peak = np.abs(v).max(axis=0, initial=1e-9)
@@ -326,7 +345,14 @@ def _read(past: np.ndarray, errors: np.ndarray, rate: float, band: float, integr
 
 
 def _explained(error: np.ndarray, tau: np.ndarray, gains: np.ndarray, rate: float, band: float) -> float:
-    """Return the share [%] of a joint's low-passed torque (N,) that the gains kp, kd, ki (3,) explain."""
+    """Return the share [%] of a joint's low-passed torque (N,) that the gains kp, kd, ki (3,) explain.
+
+    Args:
+        error, tau: (N,) position error and torque of the joint, low-passed.
+        gains: (3,) kp, kd, ki.
+        rate: sampling rate [Hz].
+        band: cut-off of the low-pass [Hz].
+    """
     kp, kd, ki = gains
     rate_of_error = np.gradient(error, 1.0 / rate)
     integral = np.cumsum(error)

@@ -132,13 +132,21 @@ def instrument(
 
 
 def unseen(names: Sequence[str], units: Sequence[str], groups: int) -> Instruments:
-    """Return R factors of [Z W y] without rows, for columns of W with these names and units."""
+    """Return R factors of [Z W y] without rows, for columns of W with these names and units.
+
+    Args:
+        names, units: names and units of the p columns of W.
+        groups: number of groups of rows.
+    """
     data = empty([*(f"Z {name}" for name in names), *names], [*units, *units], groups)
     return Instruments(data)
 
 
 def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1.0) -> LinearFit:
     """Estimate x = (Zᵀ Ω⁻¹ W)⁻¹ Zᵀ Ω⁻¹ y with Ω = diag(σ_g² I), by instrumental variables.
+
+    Z (r, p) are the instruments, W (r, p) the observation matrix, y (r,) the torques, σ_g the standard deviation of the
+    rows of group g.
 
     The covariance is σ² (ZᵀΩ⁻¹W)⁻¹ (ZᵀΩ⁻¹Z) (WᵀΩ⁻¹Z)⁻¹. Janot, Vandanjon & Gautier (2014) use (ZᵀΩ⁻¹Z)⁻¹, which is
     equal if Z is W without its noise, and too small if the simulation deviates. σ² is estimated, so that a common
@@ -271,7 +279,13 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
 def projected(problem: Instruments, std: np.ndarray | None = None) -> np.ndarray:
     """Return the R factor (p + 1, p + 1) of min ‖P_Z (y - W x)‖ (two-stage least squares), whose solution is `iv`.
 
+    P_Z is the projection onto the columns of Z.
+
     Constrained IV minimises with this factor: Q = Wᵀ P_Z W is positive definite, while Zᵀ W need not be.
+
+    Args:
+        problem: R factors of [Z W y].
+        std: (g,) standard deviations of the groups; None: equal.
     """
     return _projected(combine(problem.data, std), problem.names)
 
@@ -307,6 +321,10 @@ def by_free_instruments(
 
 def _projected(factor: np.ndarray, names: Sequence[str]) -> np.ndarray:
     """Return the R factor of P_Z [W y] from the R factor of [Z W y].
+
+    Args:
+        factor: R factor of [Z W y].
+        names: names of the columns of W, for messages.
 
     Raises:
         Unidentifiable: if Z or Zᵀ W do not have full rank.
