@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from calib.procedure.excitation.settings import ExcitationSettings, PlanSettings
     from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
     from calib.procedure.session.commands import new_session
-    from calib.results.registry import open_result
     from calib.results.result import Result
+    from calib.results.result_classes import open_result
     from calib.robot.calibrated import CalibratedChain
 
 # names that `import calib` provides, and their modules, which are loaded at first use to keep `calib --help` fast
@@ -53,7 +53,7 @@ _HOMES = {
     "procedure.session.commands": ("new_session",),
     "apps.fleet.fleet": ("run_sessions",),
     "robot.calibrated": ("CalibratedChain",),
-    "results.registry": ("open_result",),
+    "results.result_classes": ("open_result",),
     "results.result": ("Result",),
     "apps.compensation.api": ("compensate", "JointCommands"),
     "apps.joining.joining": ("join",),

@@ -124,4 +124,4 @@ def _import(module: str) -> Any:
         raise
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
-        raise UsageError(f"the extension {module} does not load: {reason}; mend it or remove its folder") from error
+        raise UsageError(f"the extension {module} does not load: {reason}; correct it or remove its folder") from error

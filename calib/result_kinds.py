@@ -62,7 +62,7 @@ KINDS = (
         "a session",
         ((SESSION,),),
         {
-            "certificate": "its details stand in {folder}/session.toml, under [certificate]; then: "
+            "certificate": "its details are in {folder}/session.toml, under [certificate]; then: "
             "calib redo {folder} certificate",
             "robot": "give the robot it exported, {folder}/9-export/robot.urdf, or its fit, {folder}/4-fit",
             "export": "its last step exports the robot; for other files give {folder}/4-fit or {folder}/8-dynamics",
@@ -70,7 +70,7 @@ KINDS = (
             "compensate": "it has no fit yet: calib next {folder}",
             "recall": "give its motion, {folder}/6-excitation",
             "program": "give a list of poses or a motion in it, {folder}/2-poses/poses.csv or {folder}/6-excitation",
-            "view": "it holds nothing to show yet: calib next {folder}",
+            "view": "it has nothing to show yet: calib next {folder}",
         },
     ),
     ResultKind("export", "an exported robot", ((OFFSETS, "README.txt"), (PARAMETERS, "README.txt"))),
@@ -79,7 +79,7 @@ KINDS = (
         "identification",
         "the result of an identification",
         (("dynamics.json",),),
-        _NOT_A_SESSION | {"compensate": "give the fit that it stands on"},
+        _NOT_A_SESSION | {"compensate": "give the fit that it is based on"},
     ),
     ResultKind("excitation", "a motion of calib excite", (("trajectory.toml",),)),
     ResultKind("plan", "a motion of calib plan", (("motion.csv",),)),
@@ -132,7 +132,9 @@ def refusal(path: str | Path, verb: str) -> str:
     """
     kind = kind_of(path)
     if kind is None:
-        what = "holds no result" if Path(path).is_dir() else "is a file" if Path(path).is_file() else "does not exist"
+        what = (
+            "contains no result" if Path(path).is_dir() else "is a file" if Path(path).is_file() else "does not exist"
+        )
         return f"{path} {what}; give {TAKES[verb]}"
     advice = kind.advice.get(verb, f"give {TAKES[verb]}")
     return f"{path} is {kind.noun}; {advice.format(folder=path)}"

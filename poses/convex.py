@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .information import Candidates, log_det, prepared
+from .scaled_jacobians import Candidates, log_det, prepared
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def bound(
         tolerance: relative gap (`Bound.gap`) at which the search for a tighter bound ends.
 
     Raises:
-        BadInput, TooFewCandidates, NotIdentifiable: under the conditions of `calib.poses.information.prepared`.
+        BadInput, TooFewCandidates, NotIdentifiable: under the conditions of `calib.poses.scaled_jacobians.prepared`.
     """
     return relaxed(prepared(jacobians, m, existing), m, capped=capped, tolerance=tolerance)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .information import log_det
+from .scaled_jacobians import log_det
 
 # multiple of the identity matrix (the mean information of one candidate) added to every design, so that sets without
 # full rank can be compared (our choice); values reported to the user do not contain it
@@ -21,7 +21,7 @@ RIDGE = 1e-6
 
 @dataclass(frozen=True)
 class Pool:
-    """Candidates to choose from, in the scaled coordinates of `calib.poses.information.Candidates`.
+    """Candidates to choose from, in the scaled coordinates of `calib.poses.scaled_jacobians.Candidates`.
 
     The fields are the Jacobians z (N, rows, p) of N candidates and the information (p, p) of the poses measured before.
     """

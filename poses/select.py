@@ -19,7 +19,7 @@ from .design import Design, Pool, design_of
 from .errors import BadInput, NotIdentifiable
 from .exchange import detmax, exchanged, greedy, kicked
 from .indices import Index, merit, observability
-from .information import Candidates, checked, log_det, prepared
+from .scaled_jacobians import Candidates, checked, log_det, prepared
 from .space import SearchSpace, is_feasible
 from .whole_space import Ceiling, bound_over_space
 

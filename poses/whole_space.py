@@ -24,7 +24,7 @@ import numpy as np
 from .candidates import draw_candidates
 from .continuous.local import climb, restored
 from .convex import information_of, relaxed, scores_of
-from .information import log_det, prepared
+from .scaled_jacobians import log_det, prepared
 from .space import SearchSpace, is_feasible, product
 
 # number of poses optimised together: few for a fast SLSQP, many for an efficient Jacobian (our choice)

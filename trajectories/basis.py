@@ -40,9 +40,9 @@ class SampledMotion:
         return len(self.times)
 
     def evaluated(self, regressor: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]) -> np.ndarray:
-        """Return regressor(q, v, a) of the samples.
+        """Return regressor(q, v, a) (N, n, b) of the samples, which maps b dynamic parameters to torques.
 
-        It is stored at the first call, so that objectives and torque limits share it.
+        The result is stored at the first call, so that objectives and torque limits share it.
         """
         if regressor not in self._evaluated:
             self._evaluated[regressor] = regressor(self.q, self.v, self.a)
@@ -53,19 +53,21 @@ class SampledMotion:
         return self.q, self.v, self.a, self.jerk
 
     def part(self, rows: np.ndarray) -> SampledMotion:
-        """Return the samples with the given row numbers."""
+        """Return the samples at the indices `rows` (from 0), or where the mask `rows` (N,) is True."""
         return SampledMotion(self.times[rows], self.q[rows], self.v[rows], self.a[rows], self.jerk[rows])
 
 
 @dataclass(frozen=True, eq=False)
 class Basis:
-    """A motion family evaluated at fixed times.
+    """A motion family evaluated at fixed times: the motion as a linear function of free variables x.
+
+    The variables are the coefficients (Fourier coefficients, control points) that the equations of rest leave free.
 
     Attributes:
         times: (N,) [s].
-        offsets: (4, N, n) position, velocity, acceleration and jerk where all variables are zero.
+        offsets: (4, N, n) position, velocity, acceleration and jerk of the motion whose variables are all zero.
         tables: (n, 4, N, c) derivatives of these four by the variables of each joint, zero where a joint has fewer than
-            c variables.
+            c variables; c is the largest number of variables of a joint.
         used: (n, c) True where a joint has that variable; x lists the variables joint after joint.
     """
 
@@ -104,8 +106,11 @@ class Basis:
         return variables[self.used]
 
     def adjoint(self, slopes: np.ndarray) -> np.ndarray:
-        """Return the gradients (m, p) of m functions by the variables, from their gradients (m, 4, N, n) by q, v, a,
-        jerk.
+        """Return the gradients (m, p) of m functions by the free variables.
+
+        Args:
+            slopes: (m, 4, N, n) gradients of the m functions by position, velocity, acceleration and jerk at the N
+                times.
         """
         m, _, count, n = slopes.shape
         by_joint = slopes.transpose(3, 0, 1, 2)
@@ -135,14 +140,22 @@ class Family(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Freedom:
-    """Solutions of a joint's linear equations on its C coefficients: particular (C,) + null (C, c) x for any x (c,)."""
+    """All solutions of a joint's linear equations on its C coefficients: particular + null · x for any x (c,).
+
+    Attributes:
+        particular: (C,) one solution.
+        null: (C, c) basis of the null space of the equations.
+    """
 
     particular: np.ndarray
     null: np.ndarray
 
 
 def freedom(rows: np.ndarray, values: np.ndarray) -> Freedom:
-    """Return all solutions of the equations rows (e, C) · coefficients = values (e,).
+    """Return all solutions of e linear equations on a joint's C coefficients.
+
+    Args:
+        rows, values: the equations rows (e, C) · coefficients = values (e,).
 
     Raises:
         BadInput: the equations have no solution.
@@ -162,10 +175,10 @@ def holding(
     """Return coefficient counts and start values of the joints, where some joints are locked at a fixed value.
 
     Args:
-        counts: coefficient count of each joint.
+        counts: number of coefficients (Fourier coefficients or control points) of each joint.
         none: the coefficient count that locks a joint.
         start: (n,) joint values at the start [rad or m]; None leaves them free.
-        held: index of each locked joint, with its value [rad or m]; None locks no joint.
+        held: index (from 0) of each locked joint, with its value [rad or m]; None locks no joint.
 
     Returns:
         The counts, and the start value of each joint, None where it is free.
@@ -179,7 +192,9 @@ def holding(
         first = [float(start[j]) for j in range(len(counts))]
     for j, value in (held or {}).items():
         if not 0 <= j < len(values) or not np.isfinite(value):
-            raise BadInput(f"joint {j + 1} of {len(values)} cannot be held at {value:g}")
+            raise BadInput(
+                f"joint {j + 1} of {len(values)} cannot be held at {value:g}; choose a joint and a finite value"
+            )
         if start is not None and start[j] != value:
             raise BadInput(f"joint {j + 1} is held at {value:g}, but the motion starts from {start[j]:g}")
         values[j] = none
@@ -188,7 +203,14 @@ def holding(
 
 
 def assemble(times: np.ndarray, tables: Sequence[np.ndarray], freedoms: Sequence[Freedom]) -> Basis:
-    """Return the basis at times (N,) from the coefficient table (4, N, C_j) and the `Freedom` of each joint."""
+    """Return the basis at times (N,) [s].
+
+    Args:
+        times: (N,) [s].
+        tables: for each joint, the derivatives (4, N, C_j) of position, velocity, acceleration and jerk by its C_j
+            coefficients.
+        freedoms: for each joint, the coefficients that satisfy its equations of rest and start value.
+    """
     n = len(tables)
     widths = [free.null.shape[1] for free in freedoms]
     widest = max(1, *widths)
@@ -216,7 +238,12 @@ def counts_of_joints(counts: int | Sequence[int], joints: int | None) -> tuple[i
 
 
 def joined(freedoms: Sequence[Freedom], x: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the coefficients (C_j,) of every joint for variables x (p,)."""
+    """Return the coefficients (C_j,) of every joint for free variables x (p,), which are ordered joint after joint.
+
+    Args:
+        freedoms: for each joint, its coefficients as a linear function of its part of x.
+        x: (p,) free variables of all joints.
+    """
     widths = [free.null.shape[1] for free in freedoms]
     ends = np.cumsum(widths)[:-1]
     parts = np.split(x, ends)
@@ -224,7 +251,12 @@ def joined(freedoms: Sequence[Freedom], x: np.ndarray) -> tuple[np.ndarray, ...]
 
 
 def projected(freedoms: Sequence[Freedom], coefficients: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the variables (p,) whose coefficients are nearest to the given coefficients (C_j,) of every joint."""
+    """Return the variables (p,) whose coefficients are nearest to the given coefficients (C_j,) of every joint.
+
+    Args:
+        freedoms: for each joint, its coefficients as a linear function of its variables.
+        coefficients: for each joint, the coefficients (C_j,) to approximate by least squares.
+    """
     variables = []
     for free, values in zip(freedoms, coefficients):
         displacement = np.asarray(values) - free.particular

@@ -50,15 +50,15 @@ class MotionConstraint(Protocol):
     def groups(self) -> np.ndarray: ...
     def values(self, motion: SampledMotion) -> np.ndarray: ...
     def slopes(self, motion: SampledMotion, weights: np.ndarray) -> np.ndarray:
-        """Return the gradients (4, N, n) of Σ weights (N, k) · values by q, v, a, jerk."""
+        """Return the gradients (4, N, n) of Σ weights (N, k) · values by q, v, a, jerk of the motion."""
         ...
 
 
 class TwoSided:
-    """Columns of a two-sided limit: the upper sides of the limited joints, then their lower sides.
+    """Two-sided limit, whose columns are the upper sides of the limited joints and then their lower sides.
 
     Attributes:
-        joints: indices of the limited joints.
+        joints: indices (from 0) of the limited joints.
         rows: names of all joints; empty for "joint 1", "joint 2" ...
     """
 
@@ -147,8 +147,9 @@ class TorqueLimit(TwoSided):
     """Torque limit |Y χ| + k √(y Σ yᵀ) ≤ (1 - margin) τ_max, with y a row of Y and k σ of the torque as a margin.
 
     Attributes:
-        regressor: (q, v, a) -> observation matrix Y (N, n, b).
-        product: derivative product of the regressor, (q, v, a, G (N, n, b)) -> slopes of Σ G · Y in q, v, a.
+        regressor: (q, v, a) -> observation matrix Y (N, n, b); torques are Y χ.
+        product: derivative product of the regressor, (q, v, a, G (N, n, b)) -> gradients of Σ G · Y by q, v, a, each
+            (N, n).
         parameters: (b,) dynamic parameters χ.
         limits: (n,) τ_max [N m or N]; infinite where there is none.
         covariance: (b, b) covariance Σ of χ; None takes χ as exact.
@@ -274,7 +275,7 @@ class Smoothed(NamedTuple):
     in_group: np.ndarray
 
     def slopes(self, motion: SampledMotion) -> np.ndarray:
-        """Return the gradients (r, 4, N, n) of the r values by q, v, a, jerk of the motion."""
+        """Return the gradients (r, 4, N, n) of the r smoothed values by q, v, a, jerk of the motion."""
         # nine digits without the small shares
         counts = self.in_group[:, None] & (self.shares > 1e-9)
         group, row = np.nonzero(counts.any(axis=2))
@@ -289,12 +290,12 @@ class Smoothed(NamedTuple):
 def smoothed(
     constraint: MotionConstraint, motion: SampledMotion, sharpness: float, tightening: float = 0.0
 ) -> Smoothed:
-    """Return the smoothed values of a constraint along a motion; gradients are computed on demand.
+    """Return the smoothed values of a constraint along a motion; their gradients are computed by `Smoothed.slopes`.
 
     Args:
         constraint: the constraint.
         motion: the motion at its samples.
-        sharpness: ρ in the formula of the module's docstring.
+        sharpness: ρ of the smoothed maximum (1/ρ) log Σ exp(ρ g / scale); the larger, the closer to the maximum.
         tightening: number added to every scaled value g / scale, to keep the motion inside the limit.
     """
     scaled = constraint.values(motion) / constraint.scale + tightening

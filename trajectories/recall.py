@@ -23,10 +23,11 @@ class Recalled:
     """Whole periods of a known motion in a recording.
 
     Attributes:
-        start: number of the first sample of the first period.
+        start: index (from 0) of the recording's sample at which the first period begins.
         period: samples per period.
         periods: number of successive periods.
-        likeness: (periods,) share 1 - D / Σ |r - mean|² of the reference's variance that each period explains.
+        likeness: (periods,) share 1 - D / Σ |r - mean|² of the variance of the reference r that each period explains; D
+            is the sum of squared differences between period and reference.
         lag: distance of the best match from a whole sample, in samples, from -1/2 to 1/2.
     """
 
@@ -67,7 +68,7 @@ def find_periods(recorded: np.ndarray, reference: np.ndarray, skip: int = 0, lik
     Args:
         recorded: (N, n) measured joint positions, at the sampling rate of the reference.
         reference: (P, n) one period of the commanded motion, without the last sample, which repeats the first.
-        skip: number of periods to skip at the beginning (transients).
+        skip: number of periods to discard at the beginning, where the motion has not yet settled.
         likeness: smallest share of the reference's variance that a period must explain to be accepted.
 
     Raises:
@@ -81,7 +82,9 @@ def find_periods(recorded: np.ndarray, reference: np.ndarray, skip: int = 0, lik
     if not (np.isfinite(q).all() and np.isfinite(r).all()):
         raise BadInput("recording or reference contain values that are not numbers: cut them out first")
     if len(q) < len(r):
-        raise BadInput(f"the recording has {len(q)} samples, less than one period of the motion ({len(r)})")
+        raise BadInput(
+            f"the recording has {len(q)} samples, less than one period of the motion ({len(r)}): record longer"
+        )
     similarity = _likeness(q, r)
     best = int(similarity.argmax())
     if similarity[best] < likeness:
@@ -92,13 +95,19 @@ def find_periods(recorded: np.ndarray, reference: np.ndarray, skip: int = 0, lik
     offsets = range(best % len(r), len(similarity), len(r))
     chain = [k for k in offsets if similarity[k] >= likeness]
     run = _run_with(chain, best, len(r))[skip:]
-    require(run, f"the recording contains fewer than {skip + 1} whole periods of the motion")
+    require(
+        run, f"the recording contains fewer than {skip + 1} whole periods of the motion: record more, or skip fewer"
+    )
     likenesses = tuple(float(similarity[k]) for k in run)
     return Recalled(run[0], len(r), len(run), likenesses, _lag(similarity, best))
 
 
 def average(values: np.ndarray, mean: Recalled) -> Averaged:
-    """Return mean and variance of signals (N, k) over the whole periods `mean` of a recording.
+    """Return mean and variance of k signals over the whole periods of a recording.
+
+    Args:
+        values: (N, k) the signals, at the samples of the recording.
+        mean: the periods in the recording, from `find_periods`.
 
     Raises:
         BadInput: fewer than two periods.
@@ -111,7 +120,14 @@ def average(values: np.ndarray, mean: Recalled) -> Averaged:
 
 
 def _likeness(q: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Return 1 - D(k) / Σ |r - mean|² (N - P + 1,) of recording q and reference r for every start sample k."""
+    """Return the share 1 - D(k) / Σ |r - mean|² (N - P + 1,) of the variance of r explained at every start sample k.
+
+    D(k) is the sum of squared differences between q from sample k on and r.
+
+    Args:
+        q: (N, n) recording.
+        r: (P, n) reference.
+    """
     centre = r.mean(axis=0)
     q = q - centre
     r = r - centre
@@ -125,7 +141,7 @@ def _likeness(q: np.ndarray, r: np.ndarray) -> np.ndarray:
 
 
 def sliding_products(x: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Return Σ_i x[k + i] r[i] (N - P + 1,) for every position k of r (P,) in x (N,), by FFT."""
+    """Return Σ_i x[k + i] r[i] (N - P + 1,) for every start sample k of r (P,) in x (N,), by FFT."""
     size = next_fast_len(len(x) + len(r) - 1, real=True)
     spectrum = np.fft.rfft(x, size) * np.fft.rfft(r[::-1], size)
     products = np.fft.irfft(spectrum, size)
@@ -133,7 +149,13 @@ def sliding_products(x: np.ndarray, r: np.ndarray) -> np.ndarray:
 
 
 def _run_with(places: list[int], best: int, period: int) -> list[int]:
-    """Return those start samples that follow one another by exactly one period and include the best match."""
+    """Return the start samples, including the best match, that follow one another by exactly one period.
+
+    Args:
+        places: start samples of acceptable matches, rising.
+        best: start sample of the best match, one of `places`.
+        period: samples per period.
+    """
     k = places.index(best)
     first = last = k
     while first and places[first - 1] == places[first] - period:
@@ -144,7 +166,12 @@ def _run_with(places: list[int], best: int, period: int) -> list[int]:
 
 
 def _lag(similarity: np.ndarray, best: int) -> float:
-    """Return the peak of the parabola through the best match and its neighbours, in samples from the best match."""
+    """Return the peak of the parabola through the best match and its neighbours, in samples from the best match.
+
+    Args:
+        similarity: similarity to the reference at every start sample.
+        best: start sample of the best match.
+    """
     if not 0 < best < len(similarity) - 1:
         return 0.0
     before, lag_index, after = similarity[best - 1 : best + 2]

@@ -55,7 +55,7 @@ class Setpoints:
 
 
 def joined(tracks: Sequence[Setpoints]) -> Setpoints:
-    """Return tracks concatenated; each begins at the last sample of the previous one.
+    """Return motions concatenated; each begins at the last sample of the previous one.
 
     Raises:
         BadInput: tracks of different rates, or a jump of position or speed between two tracks; the message gives joint
@@ -85,7 +85,14 @@ def joined(tracks: Sequence[Setpoints]) -> Setpoints:
 
 
 def _check_seam(k: int, quantity: str, end: np.ndarray, start: np.ndarray, max_jump: float) -> None:
-    """Raise BadInput where the end of motion k and the start of the next differ by more than `max_jump`."""
+    """Raise BadInput where the end of a motion and the start of the next differ by more than `max_jump`.
+
+    Args:
+        k: index (from 0) of the first of the two motions.
+        quantity: name of the compared quantity in the message ("position" or "speed").
+        end, start: (n,) values at the end of motion k and at the start of the next.
+        max_jump: largest permitted difference, in the unit of the values.
+    """
     jump = np.abs(start - end)
     if jump.max() > max_jump:
         j = int(jump.argmax())
@@ -96,7 +103,7 @@ def _check_seam(k: int, quantity: str, end: np.ndarray, start: np.ndarray, max_j
 
 
 def slowed(track: Setpoints, factor: float) -> Setpoints:
-    """Return the track `factor` times slower, for a rehearsal at low speed: v / factor, a / factor², without torques.
+    """Return the motion `factor` times slower, for a rehearsal at low speed: v / factor, a / factor², without torques.
 
     Positions between the samples are interpolated by cubic Hermite polynomials, which match q and v at every sample.
 

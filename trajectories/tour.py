@@ -73,7 +73,12 @@ def tour(times: np.ndarray, first: int | None = None) -> np.ndarray:
 
 
 def _nearest_first(cost: np.ndarray, start: int) -> list[int]:
-    """Return the tour that goes from each pose to the nearest pose not yet visited."""
+    """Return the tour that goes from each pose to the nearest pose not yet visited.
+
+    Args:
+        cost: (m, m) durations of the moves between the poses [s].
+        start: index (from 0) of the first pose.
+    """
     order = [start]
     unvisited = set(range(len(cost))) - {start}
     while unvisited:
@@ -85,7 +90,12 @@ def _nearest_first(cost: np.ndarray, start: int) -> list[int]:
 
 
 def _improved(order: np.ndarray, cost: np.ndarray) -> np.ndarray:
-    """Return a closed tour that no reversal or relocation shortens, by repeating the change that saves most."""
+    """Return a closed tour that no reversal or relocation shortens, by repeating the change that saves most.
+
+    Args:
+        order: (m,) indices of the poses in the order of the tour.
+        cost: (m, m) durations of the moves between the poses [s].
+    """
     while True:
         shorter = _reversed(order, cost)
         if shorter is None:
@@ -99,6 +109,10 @@ def _reversed(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
     """Return the tour after the reversal that saves most; None if none saves time.
 
     A reversal replaces the edges a-b and c-d by a-c and b-d.
+
+    Args:
+        order: (m,) indices of the poses in the order of the closed tour.
+        cost: (m, m) durations of the moves between the poses [s].
     """
     after = np.roll(order, -1)
     edge = cost[order, after]
@@ -115,6 +129,10 @@ def _relocated(order: np.ndarray, cost: np.ndarray) -> np.ndarray | None:
     """Return the tour after moving up to three successive poses, reversed or not, elsewhere; None if none saves time.
 
     The move with the largest saving is made.
+
+    Args:
+        order: (m,) indices of the poses in the order of the closed tour.
+        cost: (m, m) durations of the moves between the poses [s].
     """
     count = len(order)
     best = (1e-9, 0, 0, 0, False)

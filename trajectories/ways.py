@@ -41,9 +41,10 @@ class Room:
 
 
 def straight_is_clear(room: Room, start: np.ndarray, end: np.ndarray) -> bool:
-    """Return whether the straight move between two poses (n,) is free of collision.
+    """Return whether the straight move in joint space between two poses `start` and `end` (n,) is free of collision.
 
-    About eight poses spread over the move are checked first, to end early on a collision.
+    About eight poses spread over the move are checked first, to end early on a collision. `room` gives the check for
+    collision and the spacing of checked poses.
     """
     steps = np.abs(end - start) / room.spacing
     count = max(int(np.ceil(steps.sum())), 1)
@@ -99,7 +100,13 @@ def way(room: Room, start: np.ndarray, goal: np.ndarray, seed: int = 0, most: in
 
 
 def _grown(room: Room, tree: tuple[list[np.ndarray], list[int]], aim: np.ndarray) -> int | None:
-    """Extend a tree by one step towards the pose `aim`; return the new node's number, None if the step collides."""
+    """Extend a tree by one step towards the pose `aim`; return the new node's index, None if the step collides.
+
+    Args:
+        room: joint limits and the check for collision.
+        tree: poses of the nodes, and the index of each node's parent.
+        aim: (n,) pose [rad or m].
+    """
     nodes, parents = tree
     steps = (aim - np.array(nodes)) / room.unit
     nearest = int(np.linalg.norm(steps, axis=1).argmin())
@@ -115,7 +122,13 @@ def _grown(room: Room, tree: tuple[list[np.ndarray], list[int]], aim: np.ndarray
 
 
 def _branch(nodes: list[np.ndarray], parents: list[int], leaf: int) -> list[np.ndarray]:
-    """Return the nodes from a leaf to the root."""
+    """Return the poses of a tree from a leaf to the root.
+
+    Args:
+        nodes: (n,) pose of each node.
+        parents: index of each node's parent.
+        leaf: index of the leaf.
+    """
     branch = []
     while leaf >= 0:
         branch.append(nodes[leaf])
@@ -124,7 +137,13 @@ def _branch(nodes: list[np.ndarray], parents: list[int], leaf: int) -> list[np.n
 
 
 def _shortened(room: Room, places: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Return a path with detours replaced by straight moves between its poses, or between points on its lines."""
+    """Return a path with detours replaced by straight moves between its poses, or between points on its lines.
+
+    Args:
+        room: joint limits and the check for collision.
+        places: (k, n) poses of the path.
+        generator: generator of the random numbers.
+    """
     for _ in range(SHORTENINGS):
         if len(places) < 3:
             break

@@ -17,8 +17,8 @@ from calib.procedure.dynamic_stage import identify as arm_identify
 from calib.procedure.kinematic_stage import fit as arm_fit
 from calib.procedure.kinematic_stage import inputs as measured
 from calib.procedure.robot_kinds import MechanismResult
-from calib.results.registry import open_result
 from calib.results.result import ExportSettings, Result
+from calib.results.result_classes import open_result
 
 
 @overload

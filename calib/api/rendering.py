@@ -143,7 +143,7 @@ class Kept(Shown, ABC):
 
     def tables(self) -> Mapping[str, Table]:
         """Return the tables by name, with the content of the files that `save` writes."""
-        from calib.results.registry import open_result
+        from calib.results.result_classes import open_result
 
         with saved(self) as folder:
             return open_result(folder).tables()
@@ -154,7 +154,7 @@ class Kept(Shown, ABC):
         Args:
             robot: name or file of the robot to draw; None takes the robot of the result.
         """
-        from calib.results.registry import open_result
+        from calib.results.result_classes import open_result
 
         with saved(self) as folder:
             return open_result(folder, "view").scene(robot)

@@ -140,7 +140,12 @@ def run(arguments: list[str] | None = None) -> int:
 
 
 def _failed(error: Exception, arguments: list[str]) -> int:
-    """Print an error, write a bug report if it is an internal error, and return the exit code."""
+    """Print an error, write a bug report if it is an internal error, and return the exit code.
+
+    Args:
+        error: the exception that ended the command.
+        arguments: arguments of the command line, for the message and the bug report.
+    """
     from calib import bug_reports
     from calib.errors import complaint
 

@@ -13,6 +13,9 @@ def robots(incomplete: str) -> Iterator[str]:
     """Yield completions of a robot's name.
 
     These are the robots of the library whose names begin with the typed text, followed by such files and folders.
+
+    Args:
+        incomplete: the text typed so far.
     """
     from calib.procedure.robot_kinds import ROBOTS
 

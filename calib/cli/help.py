@@ -19,10 +19,9 @@ _WORDS = {int: "N", float: "NUMBER", Path: "PATH"}
 
 
 def type_word(kind: object, choices: tuple[str, ...] | str = ()) -> str | None:
-    """Return the text for an option's value in the help: the allowed texts if they are short, otherwise a word for the
-    type.
+    """Return the word for an option's value in the help text; None for a flag, which has no value.
 
-    None for a flag, which has no value.
+    It lists the allowed texts if they are short, otherwise it names the type.
 
     Args:
         kind: type of the option's value.
@@ -40,7 +39,10 @@ def type_word(kind: object, choices: tuple[str, ...] | str = ()) -> str | None:
 
 
 class _Spelt(_ClickCommand):
-    """Help text in characters that the console can print; Typer alone would always write UTF-8."""
+    """Base class of commands whose help text uses only characters that the console can print.
+
+    Typer alone would always write UTF-8.
+    """
 
     def get_help(self, ctx: Any) -> str:
         console = sys.stdout.encoding or "utf-8"
@@ -83,6 +85,9 @@ def spelt(error: Any) -> tuple[str, int]:
     """Return ASCII replacements (sigma, ^2, ...) for characters that an encoding lacks; an error handler of `codecs`.
 
     Characters without a replacement are represented by their number.
+
+    Args:
+        error: the UnicodeEncodeError with the text and the position of the characters.
 
     Returns:
         The replacements, and the position at which the encoding continues.

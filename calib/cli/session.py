@@ -70,7 +70,7 @@ def _completed(answers: Answers) -> Answers:
 
     if not sys.stdin.isatty():
         missing = "--robot" if answers.robot is None else "--instrument"
-        raise UsageError(f"{missing} is missing; at a terminal, `calib new` asks for it")
+        raise UsageError(f"{missing} is missing: give it, or run `calib new` at a terminal, which asks for it")
     for question in QUESTIONS:
         while question.open(answers):
             answer = typer.prompt(question.words, default=question.default, show_default=bool(question.default))
@@ -152,7 +152,7 @@ def status(folder: Folder) -> None:
     Example: calib status cell
     """
     from calib.procedure.session import commands
-    from calib.results.registry import open_result
+    from calib.results.result_classes import open_result
 
     say(*open_result(folder, "session").status(), result=True)
     say(*commands.noted(folder))

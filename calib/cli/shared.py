@@ -40,7 +40,7 @@ def check_destination(verb: str, robot: object, out: Path, inputs: Sequence[str 
 
     Args:
         verb: name of the command.
-        robot: a serial arm or another robot, as named by the user.
+        robot: the robot as the user named it: file, library name or folder of a fit.
         out: folder for the results.
         inputs: files that the command reads, which must not be overwritten; None: no file.
 
@@ -180,7 +180,7 @@ def say_written(lines: Iterable[object], out: Path, verdict: str = "") -> None:
     """Print the lines on a result, and the path to which the result was written.
 
     Args:
-        lines: the lines.
+        lines: texts and rich renderables to print.
         out: path of the result.
         verdict: level of the verdict; empty: no verdict.
 
@@ -300,7 +300,7 @@ def command(app: typer.Typer, group: str, name: str | None = None, listing: bool
     Args:
         app: the Typer application.
         group: group of the command in the help, one of `calib.cli.help.GROUPS`.
-        name: name of the command; None: name of the function.
+        name: name of the command; None: the function's name.
         listing: whether the command prints a list, which is never shortened.
     """
 
@@ -348,7 +348,14 @@ def command(app: typer.Typer, group: str, name: str | None = None, listing: bool
 
 
 def _with_help(parameter: Parameter, hint: object, description: str, names: Sequence[str]) -> object:
-    """Return the annotation of a parameter for Typer, with help text and a word for the type of the value."""
+    """Return the annotation of a parameter for Typer, with help text and a word for the type of the value.
+
+    Args:
+        parameter: parameter of the command's function.
+        hint: its type annotation.
+        description: the help text.
+        names: names of the option, such as ``--out``; empty: Typer's default.
+    """
     kind, *metadata = get_args(hint) if get_origin(hint) is Annotated else (hint,)
     stated = [item for item in metadata if isinstance(item, ParameterInfo)]
     if stated:
@@ -365,7 +372,11 @@ def _with_help(parameter: Parameter, hint: object, description: str, names: Sequ
 
 
 def _options(kind: type) -> Iterator[Parameter]:
-    """Yield the options of a settings dataclass, including those of nested settings dataclasses."""
+    """Yield the options of a settings dataclass, including those of nested settings dataclasses.
+
+    Args:
+        kind: the settings dataclass.
+    """
     hints = get_type_hints(kind, include_extras=True)
     descriptions = described(kind)
     for field in fields(kind):
@@ -399,7 +410,7 @@ def _options(kind: type) -> Iterator[Parameter]:
 
 
 def _typed(metadata: Sequence[object]) -> Typed:
-    """Return the metadata on how a setting is typed on the command line; a default if there is none."""
+    """Return how a setting is typed on the command line, from its annotation's metadata; or a default."""
     for item in metadata:
         if isinstance(item, Typed):
             return item
@@ -407,9 +418,13 @@ def _typed(metadata: Sequence[object]) -> Typed:
 
 
 def _as_typed(message: str, options: Sequence[Parameter]) -> str:
-    """Return an error message with its first word replaced by the option of this name.
+    """Return an error message whose first word, if it is the name of a parameter, is replaced by the option's name.
 
     ``sigmas: …`` or ``lock joint9: …`` then begin with ``--sigmas`` or ``--lock``. Other messages are unchanged.
+
+    Args:
+        message: the error message.
+        options: the command's parameters.
     """
     match = re.match(r"\w+(?=:| \S+: )", message)
     if match is None:
@@ -426,7 +441,7 @@ def _as_typed(message: str, options: Sequence[Parameter]) -> str:
 
 
 def _plain(hint: Any) -> tuple[Any, tuple[object, ...]]:
-    """Return the type in an annotation without None, and the metadata of the annotation."""
+    """Return the type in the annotation `hint` without None, and the metadata of the annotation."""
     if get_origin(hint) is Annotated:
         plain, metadata = _plain(get_args(hint)[0])
         return plain, (*metadata, *hint.__metadata__)
@@ -437,13 +452,23 @@ def _plain(hint: Any) -> tuple[Any, tuple[object, ...]]:
 
 
 def _is_repeated(plain: object) -> bool:
-    """Return whether an option is repeated for each item; a list of numbers is instead one comma-separated text."""
+    """Return whether an option is repeated for each item of a list.
+
+    A list of numbers is instead one comma-separated text.
+
+    Args:
+        plain: type of the option's value, without None.
+    """
     first, last = get_args(plain)[0], get_args(plain)[-1]
     return last is ... and _plain(first)[0] is not float
 
 
 def _built(kind: type[S], values: dict[str, object]) -> S:
     """Return a settings object with the values from the command line; missing values are the defaults.
+
+    Args:
+        kind: the settings dataclass.
+        values: values of the command's options by parameter name.
 
     Raises:
         UsageError: for an invalid value.
@@ -473,7 +498,12 @@ def _chosen(kind: type, values: dict[str, object]) -> dict[str, object]:
 
 
 def _read(hint: object, value: Any) -> object:
-    """Return a value as it would be in an option file: comma-separated texts as lists, numbers with their unit."""
+    """Return a value as it would be in an option file: comma-separated texts as lists, numbers with their unit.
+
+    Args:
+        hint: type annotation of the setting.
+        value: value from the command line.
+    """
     plain, metadata = _plain(hint)
     unit = _typed(metadata).unit
     if unit:

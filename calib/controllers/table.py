@@ -125,7 +125,9 @@ def check_controller(name: str, axes: int, pulses: Sequence[float] = ()) -> None
     controller = controller_named(name)
     allowed = " or ".join(map(str, controller.axes))
     require(not allowed or axes in controller.axes, f"{axes} joints; {controller.title} takes {allowed}", UsageError)
-    message = f"{controller.title} needs the pulses per degree of each of {axes} axes: calib program --pulse"
+    message = (
+        f"{controller.title} needs the pulses per degree of each of {axes} axes: give them by calib program --pulse"
+    )
     require(not controller.pulses or (len(pulses) == axes and all(pulses)), message, UsageError)
 
 

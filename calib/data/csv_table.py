@@ -286,7 +286,9 @@ def _first_line(file: IO[str], path: str | Path, headed: bool) -> tuple[str, lis
         line_start = 0
         for line in iter(partial(file.readline, LONGEST), ""):
             if len(line) == LONGEST:
-                refuse_data(path, f"has a line of more than {LONGEST} characters: not a table")
+                refuse_data(
+                    path, f"has a line of more than {LONGEST} characters: it is not a table; was it saved as CSV?"
+                )
             text = line.strip()
             if text.startswith("#"):
                 comment = text
@@ -307,7 +309,7 @@ def _first_line(file: IO[str], path: str | Path, headed: bool) -> tuple[str, lis
         raise _not_utf8(error, path) from error
     except (csv.Error, StopIteration) as error:
         raise MeasurementError(f"is no CSV: {error}", path) from error
-    refuse_data(path, "is empty: no header and no rows")
+    refuse_data(path, "is empty: a header and rows are needed")
 
 
 def _with_quoted_breaks(line: str, file: IO[str]) -> str:

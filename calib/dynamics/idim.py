@@ -49,7 +49,9 @@ class IdentificationModel:
             for row, motion in term.acts:
                 joints = [row, *(joint for joint, _ in motion)]
                 if min(joints) < 0 or max(joints) >= self.n:
-                    raise CalibError(f"term '{term.name}' refers to a missing joint; the robot has {self.n}")
+                    raise CalibError(
+                        f"term '{term.name}' refers to a joint that does not exist; the robot has joints 1 to {self.n}"
+                    )
 
     @property
     def n(self) -> int:

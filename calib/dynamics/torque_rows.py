@@ -217,7 +217,9 @@ class TorqueRows:
             CalibError: for rows with a projection, whose derivative with respect to the state is not implemented.
         """
         if self.projection is not None:
-            raise CalibError(f"rows '{self.name}' use a projection that depends on the state: no derivatives")
+            raise CalibError(
+                f"rows '{self.name}' use a projection that depends on the state and have no derivatives: use other rows"
+            )
         acting = []
         for block in self.blocks:
             acts = [side in block.sides for side in sides]

@@ -97,10 +97,16 @@ def minimise(
         if solution is not None and str(solution.status) in FINAL:
             break
     if solution is None:
-        raise NotConverged("the constraints are not solvable to any accuracy: Clarabel's eigenvalues do not converge")
+        raise NotConverged(
+            "the constraints are not solvable to any accuracy: Clarabel's eigenvalues do not converge; relax or "
+            "remove constraints"
+        )
     values = np.array(solution.x)[:p]
     if str(solution.status) not in OPTIMAL:
-        raise NotConverged(f"the constraints may contradict each other: Clarabel reports {solution.status}", values)
+        raise NotConverged(
+            f"the constraints may contradict each other: Clarabel reports {solution.status}; relax or remove some",
+            values,
+        )
     dual = np.array(solution.z)
     matrix_multipliers = np.zeros((size, n, n))
     matrix_multipliers[:, i, j] = dual[end_of_rows:].reshape(size, len(i)) / weight

@@ -222,5 +222,10 @@ def _check_lists(names: Sequence[str], keep: Sequence[str], drop: Sequence[str])
     unknown = [name for name in (*keep, *drop) if name not in names]
     require(not unknown, f"keep or drop: unknown {', '.join(unknown)}; the parameters are {', '.join(names)}")
     both = [name for name in keep if name in drop]
-    require(not both, f"{', '.join(both)} cannot be both kept and dropped")
-    require(len(set(drop)) < len(names), "all parameters are dropped: no model remains", Unidentifiable, drop)
+    require(not both, f"{', '.join(both)} cannot be both kept and dropped: remove them from keep or drop")
+    require(
+        len(set(drop)) < len(names),
+        "all parameters are dropped, so that no model remains: drop fewer",
+        Unidentifiable,
+        drop,
+    )

@@ -38,7 +38,7 @@ class Status(Enum):
     """Reason why an iteration ended; the value of a member is its message with advice."""
 
     CONVERGED = "converged"
-    STALLED = "stalled: no damping gives a better step; the model is at its smallest residual or the Jacobian is wrong"
+    STALLED = "stalled: no damping gives a better step; the residual is at its minimum, or the Jacobian is wrong"
     ITERATIONS = "stopped at the iteration limit; start closer (better nominal values, fewer free parameters)"
 
     @property

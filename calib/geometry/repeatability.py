@@ -314,7 +314,7 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, PoseMeasureme
         fitted |= set(marks)
         if before:
             name = Path(block.file).name
-            notes.append(f"{name}: {_rows(before)} identical to rows of another fitted file. Is the file given twice?")
+            notes.append(f"{name}: {_rows(before)} identical to rows of another fitted file. Was the file given twice?")
     proofless = set()
     for name, block in unseen.items():
         copied = np.array([mark in fitted for mark in _marks(block)], dtype=bool)

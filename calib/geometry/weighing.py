@@ -483,7 +483,7 @@ class Weigher:
         if len(undetermined):
             names = [layout(state).names[parameter] for parameter in undetermined]
             raise Unidentifiable(
-                f"{self.blocks[0].measured.file}: these rows no longer determine {', '.join(names)} where the search "
+                f"{self.blocks[0].measured.file}: these rows do not determine {', '.join(names)} where the search "
                 "ended; measure at more different joint values",
                 names,
             )

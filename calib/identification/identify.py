@@ -168,7 +168,7 @@ def identify_model(
     """
     settings = settings or IdentificationSettings()
     say = progress or (lambda message: None)
-    require(cases, "no recording to identify the model from", UsageError)
+    require(cases, "no recording to identify the model from: give at least one", UsageError)
     method = method_named(settings.method)
     settings = require_usable(settings, method)
     _require_constrainable(method, settings)
@@ -591,7 +591,7 @@ def _require_constrainable(method: Method, settings: IdentificationSettings) -> 
         return
     supporting = [name for name, candidate in METHODS.items() if candidate.takes_constraints]
     constrained = f"pc-{method.name}"
-    advice = f"methods that do: {', '.join(supporting)}"
+    advice = f"methods that support them: {', '.join(supporting)}"
     if constrained in supporting:
         advice = f"use '{constrained}'"
     raise UsageError(f"[constraints]: method '{method.name}' does not support them; {advice}")
@@ -600,4 +600,6 @@ def _require_constrainable(method: Method, settings: IdentificationSettings) -> 
 def _require_motion(cases: Sequence[Case]) -> None:
     """Raise an error if no joint moves in any of the training cases."""
     if all((np.ptp(case.motion.q, axis=0) < MIN_MOTION).all() for case in cases):
-        refuse_data(cases[0].motion.file, "no joint moves: only gravity in one pose is identifiable")
+        refuse_data(
+            cases[0].motion.file, "no joint moves, so only gravity in one pose is identifiable: record a motion"
+        )

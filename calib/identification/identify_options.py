@@ -120,10 +120,7 @@ def _no_zero(value: object) -> object:
     return value
 
 
-REMOVED = {
-    "cut_slow": "each standstill of a joint now counts once, its friction unknown within the static friction, so that "
-    "no rows need to be cut: remove the line"
-}
+REMOVED = {"cut_slow": "standing rows are no longer cut, since each standstill of a joint counts once: remove the line"}
 """Keys of earlier versions, and what replaced them."""
 FINDINGS = (
     "masses",

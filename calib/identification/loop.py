@@ -166,7 +166,7 @@ def check_loop(table: object) -> object:
         if key not in table:
             raise ValueError(f"controller '{kind}' needs {' and '.join(NEEDED[kind])}; '{key}' is missing")
     if kind == "identify" and table.get("share", 1.0) != 1.0:
-        raise ValueError("share: not supported with controller = 'identify', which assumes share = 1")
+        raise ValueError("share: not supported with controller = 'identify', which assumes share = 1: remove the key")
     return table
 
 
@@ -203,7 +203,7 @@ class LoopController:
             stated = np.asarray(getattr(self, name), dtype=float)
             value = np.broadcast_to(stated, (n,))
             object.__setattr__(self, name, frozen(np.array(value)))
-        require(self.delay >= 0, f"a delay of {self.delay} control periods is invalid")
+        require(self.delay >= 0, f"a delay of {self.delay} control periods is invalid: state 0 or more")
 
     @property
     def rows(self) -> np.ndarray:

@@ -97,7 +97,9 @@ def read_table(folder: Path) -> ParsedTable:
     ):
         table = json.loads((folder / MODEL).read_text(encoding="utf-8"))
     if not isinstance(table, dict):
-        raise RobotError(f"{folder}/dynamics.json is damaged or of another version: it contains no table")
+        raise RobotError(
+            f"{folder}/dynamics.json is damaged or of another version (it contains no table); identify again"
+        )
     return table
 
 
@@ -132,7 +134,9 @@ def refuse_other_arm(folder: Path, chain: Chain) -> None:
     identified = description.read(folder / ROBOT)
     if identified.n != chain.n:
         refuse_option(
-            folder, f"is of a robot with {identified.n} joints ({identified.name}), {chain.name} has {chain.n}"
+            folder,
+            f"is of a robot with {identified.n} joints ({identified.name}), but {chain.name} has {chain.n}: identify "
+            "this robot",
         )
     q = random_joints(chain, 20, 0)
     tips = forward(chain, q)[:, :3, 3]
@@ -141,7 +145,9 @@ def refuse_other_arm(folder: Path, chain: Chain) -> None:
     reach = float(np.linalg.norm(tips, axis=1).max())
     if distance > MAX_TIP_DISTANCE * reach:
         refuse_option(
-            folder, f"is of another robot ({identified.name}): its tip is {distance:.3g} m from {chain.name}'s (median)"
+            folder,
+            f"is of another robot ({identified.name}): its tip is {distance:.3g} m from that of {chain.name} "
+            "(median); identify this robot",
         )
 
 

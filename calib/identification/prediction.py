@@ -29,6 +29,8 @@ MIN_WHITENESS_SAMPLES = 40
 """Decimated samples above which the whiteness of residuals is tested."""
 MAX_LAGS = 30
 """Lags of the test of whiteness."""
+PASSING_SHARE = 10.0
+"""Unexplained share of the raw torque [%] that passes (finding ``torque-unexplained``)."""
 MAX_PREDICTED_ABOVE = 0.1
 """Predicted torque above the identification band, in squares over the measured one, up to which there is noise or what
 else no motion explains (our choice)."""
@@ -132,8 +134,12 @@ class Score:
 
     @property
     def noisy(self) -> bool:
-        """Whether most of the squared error is above the identification band, where the motion predicts no torque."""
-        return 2.0 * self.floor_percent**2 > self.raw.total**2
+        """Whether noise would decide the verdict.
+
+        The raw error does not pass, and most of its square is above the identification band, where the motion predicts
+        no torque.
+        """
+        return self.raw.total > PASSING_SHARE and 2.0 * self.floor_percent**2 > self.raw.total**2
 
     @property
     def stands(self) -> bool:

@@ -506,7 +506,7 @@ def power_block(
         UsageError: for a model without energies.
     """
     if not isinstance(model, _HasEnergy):
-        raise UsageError("rows = 'power' requires a model with energies")
+        raise UsageError("rows = 'power' is not supported by this model, which has no energies: use rows = 'motor'")
     motion = case.motion
     start = max(segment.start, part.start - DIFFERENCE_REACH)
     stop = min(segment.stop, part.stop + DIFFERENCE_REACH)

@@ -146,7 +146,11 @@ def make_model(chain: Chain, settings: IdentificationSettings) -> Identification
     Raises:
         UsageError: for settings that do not apply to this chain.
     """
-    require(not (settings.passive or settings.identical_legs), "passive, identical_legs: arms have no legs", UsageError)
+    require(
+        not (settings.passive or settings.identical_legs),
+        "passive, identical_legs: for parallel robots only; remove them",
+        UsageError,
+    )
     _check_joints(chain.n, settings)
     linear = [joint.kind == "prismatic" for joint in chain.joints]
     values = settings.sets or (settings.torque_rows.drives,)
@@ -161,7 +165,7 @@ def make_model(chain: Chain, settings: IdentificationSettings) -> Identification
             if term.name in names:
                 label = f"{first + 1}_{second + 1}"
                 raise UsageError(
-                    f'coupling: parameter {term.name} is a joint\'s own; add another label: label = "{label}"'
+                    f'coupling: {term.name} is already a joint\'s parameter; add another label: label = "{label}"'
                 )
         terms += coupled
     for term in settings.terms:
@@ -216,18 +220,21 @@ def require_usable(settings: IdentificationSettings, method: Method) -> Identifi
     if method.needs_controller and settings.loop is None:
         refuse_option(
             option,
-            "state the controller in the options file, [loop] controller = … (calib formats "
+            "needs the closed loop: state [loop] controller = … in the options file (calib formats "
             "identify-options), and log or state the reference; from q and torque alone use wls or irls",
         )
     if not method.takes(rows):
         supporting = [name for name, candidate in METHODS.items() if candidate.takes(rows)]
-        refuse_option(option, f"rows = '{rows.name}' is not supported; methods that do: {', '.join(supporting)}")
+        refuse_option(
+            option, f"rows = '{rows.name}' is not supported; methods that support it: {', '.join(supporting)}"
+        )
     if friction == "auto":
         return replace(settings, friction=method.auto_friction)
     if friction != "standard" and not method.takes_models:
         supporting = [name for name, candidate in METHODS.items() if candidate.takes_models]
         refuse_option(
             option,
-            f"standard friction only, not friction = '{friction}'; methods that take it: {', '.join(supporting)}",
+            f"supports standard friction only, not friction = '{friction}'; methods that support it: "
+            f"{', '.join(supporting)}",
         )
     return settings

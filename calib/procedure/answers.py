@@ -24,7 +24,10 @@ MAX_LETTERS = 200
 def _entry(value: object) -> object:
     """Return an entry of a certificate (text, number or date) as one line of printable text.
 
-    Other values are returned unchanged.
+    Values of other types are returned unchanged.
+
+    Args:
+        value: the entry.
 
     Raises:
         ValueError: for a text that is too long.
@@ -111,6 +114,8 @@ class Answers:
         front: number of trade-offs between condition number and torque goal to choose from; 0: none.
         tolerance_mm: largest accepted rms of the position on unseen poses [mm]; 0: none.
         tolerance_percent: largest accepted torque error of the exported robot on unseen motion [%]; 0: none.
+        tolerance_torque: largest accepted rms torque error of each joint on unseen motion [N m or N]: one number for
+            all joints, or one per joint with commas (0: none); none.
         program: controller in whose language the poses are written, too: ur, krl … (calib program --list); or none.
         details: ask for the certificate's details: number, serial numbers, operator ….
         certificate: these details.
@@ -138,6 +143,7 @@ class Answers:
     front: Annotated[int, Whole(0, 1000)] | None = None
     tolerance_mm: Tolerance | None = None
     tolerance_percent: Tolerance | None = None
+    tolerance_torque: Text | None = None
     program: Text | None = None
     details: Annotated[bool, Typed("--details/--no-details")] | None = None
     certificate: CertificateSection = field(default_factory=CertificateSection)

@@ -79,8 +79,10 @@ class Verdict:
         return cls(level_of(worst), "; ".join(parts), worst.code, advice)
 
     def for_prediction(self, reason: str) -> Verdict:
-        """Return the verdict on a model that cannot be exported for the given reason: pass becomes pass (prediction
-        only).
+        """Return the verdict on a model that cannot be exported: pass becomes pass (prediction only).
+
+        Args:
+            reason: why the model cannot be exported.
         """
         if self.level != "pass":
             return self
@@ -245,8 +247,13 @@ def lines_of(findings: Iterable[Finding]) -> list[str]:
 
 
 def as_notes(lines: Iterable[str], findings: Iterable[Finding]) -> list[Note]:
-    """Return lines of text as notes; a line that reports one of the findings that prevent the verdict pass is a
-    warning.
+    """Return lines of text as notes.
+
+    A line that reports one of the findings that prevent the verdict pass is a warning.
+
+    Args:
+        lines: the lines.
+        findings: findings whose lines are among them.
     """
     warnings = {note.text for note in notes_of(findings) if note.is_warning}
     return [Note(line, line in warnings) for line in lines]
@@ -317,15 +324,20 @@ def in_words(template: str) -> str:
 
 
 def _with_unit(text: str, unit: str) -> str:
-    """Return a printed value followed by its unit, with a space except before a degree sign."""
+    """Return a printed value `text` followed by its unit, with a space except before a degree sign."""
     if unit in ("", "°"):
         return text + unit
     return f"{text} {unit}"
 
 
 def _filled(template: str, values: Mapping[str, object]) -> str:
-    """Return a template with the values inserted; an optional part ``<…>`` is omitted if one of its values is None or
-    empty.
+    """Return a template with the values inserted.
+
+    An optional part ``<…>`` is omitted if one of its values is None or empty.
+
+    Args:
+        template: sentence of the catalogue.
+        values: name -> value.
     """
 
     def part(match: re.Match[str]) -> str:

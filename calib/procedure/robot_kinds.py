@@ -101,7 +101,13 @@ class Mechanism(Protocol):
         ...
 
     def model_table(self, dynamics: Any, base: Any, unit: str) -> dict[str, object]:
-        """Return an identified dynamic model of this robot in the form of ``dynamics.json``."""
+        """Return an identified dynamic model of this robot in the form of ``dynamics.json``.
+
+        Args:
+            dynamics: the model.
+            base: its base parameters.
+            unit: unit of the torques.
+        """
         ...
 
 
@@ -113,12 +119,21 @@ class MechanismResult(Protocol):
     def verdict(self) -> Verdict: ...
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Write a result folder with the same files as `calib fit` or `calib identify`, and return its path."""
+        """Write a result folder with the same files as `calib fit` or `calib identify`, and return its path.
+
+        Args:
+            out: the folder.
+            plots: whether figures are drawn.
+        """
         ...
 
     def with_unseen(self, unseen: Sequence[object]) -> MechanismResult:
-        """Return the result with a verdict that also covers further held-out files; nothing is fitted or identified
-        again.
+        """Return the result with a verdict that also covers further held-out files.
+
+        Nothing is fitted or identified again.
+
+        Args:
+            unseen: the files: measurements for a fit, recordings for an identification.
         """
         ...
 
@@ -156,7 +171,7 @@ def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None 
         return None
     stages = next(kind for kind in ROBOTS.all() if machine.kind == kind.KIND).stages()
     if verb not in stages:
-        advice = machine.instead.get(verb, f"{', '.join(stages)} take it")
+        advice = machine.instead.get(verb, f"use {', '.join(stages)}")
         name = machine.source
         if isinstance(robot, (str, Path)):
             name = robot
@@ -170,6 +185,12 @@ def stage_of(robot: object, verb: str, base: str | None = None, tip: str | None 
 
 def _run(run: Callable[..., object], machine: Mechanism, *args: object, **options: object) -> object:
     """Return the result of a command for a robot that is not a serial arm.
+
+    Args:
+        run: implementation of the command.
+        machine: the robot.
+        *args: further positional arguments of the command.
+        **options: arguments of the command by name.
 
     Raises:
         UsageError: for an argument with a value that applies to serial arms only.
@@ -186,7 +207,11 @@ def _run(run: Callable[..., object], machine: Mechanism, *args: object, **option
 
 
 def joints_of(chain: Any) -> Joints:
-    """Return names, kinds, position and torque limits of the joints, for checking measurements and recordings."""
+    """Return names, kinds, position and torque limits of the joints, for checking measurements and recordings.
+
+    Args:
+        chain: the arm; for other robots, an object with its actuated joints.
+    """
     # slow to load, and the shell's completion asks this module for the kinds of robot
     import numpy as np
 

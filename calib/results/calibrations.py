@@ -29,18 +29,17 @@ if TYPE_CHECKING:
 
 
 class CalibratedRobot(Viewed):
-    """A folder that contains a robot calibrated from a nominal one (``robot.toml``)."""
+    """A folder that contains a robot calibrated from a nominal one (nominal and calibrated robot: ``robot.toml``)."""
 
     def check_arm(self, verb: str) -> None:
         stage_of(self.path, verb)
 
     def export(self, into: Path, settings: ExportSettings) -> Exported:
-        """Write the robot for other programs: all file formats into a folder, or a ROS 2 package into a folder below
-        it.
+        """Write the robot for other programs, in all file formats or as a ROS 2 package.
 
         Args:
-            into: the folder.
-            settings: source and format.
+            into: folder to write into, which is created if necessary.
+            settings: URDF to change (or the fit's robot), and format of the export.
 
         Returns:
             Messages on verdicts and files.
@@ -72,7 +71,12 @@ class CalibratedRobot(Viewed):
         return Exported(delivery.mark(into, self.verdicts), lines)
 
     def _export_sources(self, settings: ExportSettings) -> delivery.Export:
-        """Return the sources of an export: the fit, and the nominal robot's description (default: that of the fit)."""
+        """Return the sources of an export: this folder, and the nominal robot's description.
+
+        Args:
+            settings: the user's settings; ``urdf`` is the nominal robot's URDF, None takes the description that the fit
+                used.
+        """
         if settings.urdf is not None:
             return delivery.Export(settings.urdf, self.path)
         source = geometry.read(self.path).source

@@ -1,8 +1,9 @@
 """The protocol of results: `Result`, which results in memory and stored results implement.
 
-Commands that take a result open it (`calib.results.registry.open_result`) and call its methods. `StoredResult` is the
-class of all kinds in folders; a kind with additional functions has a subclass. If a kind does not support a method, the
-method raises an error with advice on the folder or command to use instead (`calib.result_kinds`).
+Commands that take a result open it (`calib.results.result_classes.open_result`) and call its methods.
+`StoredResult` is the class of all kinds in folders; a kind with additional functions has a subclass. If a kind does not
+support a method, the method raises an error with advice on the folder or command to use instead
+(`calib.result_kinds`).
 """
 
 from __future__ import annotations
@@ -50,7 +51,12 @@ class Result(Protocol):
         ...
 
     def save(self, out: str | Path, /, *, plots: bool = True) -> Path:
-        """Write the result into a folder (a list of poses into files), and return the path."""
+        """Write the result into a folder (a list of poses: into files), and return the path.
+
+        Args:
+            out: the folder; for a list of poses, the CSV file.
+            plots: whether figures are drawn and written, too.
+        """
         ...
 
     def figures(self) -> Mapping[str, Picture]:
@@ -71,7 +77,16 @@ class Result(Protocol):
 
 
 class ExportSettings(NamedTuple):
-    """Source and format of an exported robot; the fields are the arguments of `calib.export`."""
+    """Source and format of an exported robot.
+
+    Attributes:
+        urdf: URDF of the nominal robot, to be changed; None: the fit's robot is used.
+        prior: prior for masses that the torques do not identify: ``entropic`` or ``euclidean``.
+        ros2: name of a ROS 2 package to write; empty: all file formats are written instead.
+        moveit: MoveIt files to copy into the package.
+        control: whether the package's URDF gets a ``<ros2_control>`` for mock hardware if it has none.
+        overwrite: whether existing files are replaced.
+    """
 
     urdf: Path | None = None
     prior: str = "entropic"
@@ -89,7 +104,7 @@ class Exported(NamedTuple):
 
 
 def _has_rows(path: Path) -> bool:
-    """Return whether a CSV table has a row below its header; comments are ignored."""
+    """Return whether the CSV table at `path` has a row below its header; comments are ignored."""
     with path.open(encoding="utf-8", errors="replace") as file:
         lines = (line for line in file if not line.startswith("#"))
         return next(lines, None) is not None and next(lines, None) is not None
@@ -139,7 +154,7 @@ class StoredResult:
         return None
 
     def check_arm(self, verb: str) -> None:
-        """Raise an error if the command `verb` does not support the robot; the base class accepts all results."""
+        """Raise an error if the command `verb` does not support this result's robot; the base class never does."""
 
     def require_session(self) -> Session:
         """Raise an error, since the result is not a session; the class of sessions returns the session instead."""
@@ -185,15 +200,29 @@ class StoredResult:
         )
 
     def scene(self, robot: str | None = None) -> Scene:
-        """Raise an error, since there is nothing to draw; subclasses return a scene."""
+        """Raise an error, since there is nothing to draw; subclasses return a scene.
+
+        Args:
+            robot: name or file of the robot to draw; None: the result's robot.
+        """
         self.refuse("view")
 
     def export(self, into: Path, settings: ExportSettings) -> Exported:
-        """Raise an error, since there is no calibrated robot to export; subclasses export it."""
+        """Raise an error, since there is no calibrated robot to export; subclasses export it.
+
+        Args:
+            into: folder to write into.
+            settings: source and format of the export.
+        """
         self.refuse("export")
 
     def pages(self, details: CertificateSection, plots: bool = True) -> tuple[Certificate, Page]:
-        """Raise an error, since the result has neither certificate nor report; subclasses return both."""
+        """Raise an error, since the result has neither certificate nor report; subclasses return both.
+
+        Args:
+            details: certificate entries made by a person.
+            plots: whether to include figures.
+        """
         self.refuse("certificate")
 
     def certify(self, details: CertificateSection, plots: bool, svg: Path | None) -> list[str]:
@@ -222,10 +251,10 @@ class StoredResult:
         self.refuse("session", SessionError)
 
     def refuse(self, verb: str, kind: type[CalibError] = UsageError) -> NoReturn:
-        """Raise the error of a command (`calib.result_kinds.TAKES`) that does not support this result.
+        """Raise the error that a command does not support this kind of result.
 
         Args:
-            verb: name of the command.
+            verb: name of the command, a key of `calib.result_kinds.TAKES`.
             kind: class of the error.
         """
         raise kind(refusal(self.path, verb))

@@ -22,8 +22,7 @@ FRAMES = 50.0
 
 @runtime_checkable
 class Drawn(Protocol):
-    """A robot that is not a serial arm, as its command ``view`` (`calib.procedure.robot_kinds.CommandStage`) returns
-    it.
+    """A robot to draw that is not a serial arm, as the command ``view`` of its kind returns it.
 
     Attributes:
         n, joints, joint_names: number, properties and names of the actuated joints.
@@ -93,8 +92,12 @@ class Measured:
     turned: np.ndarray
 
     def arrow_scale(self, chain: Chain | Drawn) -> float:
-        """Return a factor (1, 2 or 5 times a power of ten) for error arrows, so that large arrows are about a tenth of
-        the arm.
+        """Return a factor (1, 2 or 5 times a power of ten) by which the viewer enlarges error arrows.
+
+        Large arrows are then about a tenth of the arm's extent.
+
+        Args:
+            chain: the robot that is drawn.
         """
         span = float(np.ptp(strips(chain, self.q)[0][:, -1], axis=0).max()) or 1.0
         large = float(np.quantile(np.linalg.norm(self.seen - self.nominal, axis=1), 0.9)) or 1e-3
@@ -127,8 +130,13 @@ class ErrorSizes:
 
 @dataclass(frozen=True, eq=False)
 class Played:
-    """A motion, with name, times t (N,) [s], joint values q (N, n) [rad or m], and velocities v (N,
-    n); None: unknown.
+    """A motion of the drawn robot.
+
+    Attributes:
+        name: name in the viewer.
+        t: (N,) times [s].
+        q: (N, n) joint values [rad or m].
+        v: (N, n) joint velocities [rad/s or m/s]; None: unknown.
     """
 
     name: str
@@ -186,14 +194,24 @@ class Scene:
 
 
 def strips(chain: Chain | Drawn, q: np.ndarray) -> list[np.ndarray]:
-    """Return the polylines (m, k, 3) [m] that represent a robot at joint values q (m, n); an arm has one polyline."""
+    """Return the polylines (m, k, 3) [m] that represent a robot at joint values q (m, n) [rad or m].
+
+    Args:
+        chain: the robot; a serial arm has one polyline, through base, joints and tip.
+        q: joint values of m poses.
+    """
     if isinstance(chain, Chain):
         return [skeleton(chain, q)]
     return chain.strips(q)
 
 
 def skeleton(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return the positions (m, n + 2, 3) [m] of base, joints and tip of an arm at joint values q (m, n)."""
+    """Return the positions (m, n + 2, 3) [m] of base, joints and tip of an arm.
+
+    Args:
+        chain: the arm.
+        q: (m, n) joint values of m poses [rad or m].
+    """
     points = np.zeros((len(q), chain.n + 2, 3))
     points[:, 1:-1] = joint_frames(chain, q)[:, :, :3, 3].transpose(1, 0, 2)
     points[:, -1] = forward(chain, q)[:, :3, 3]
@@ -201,12 +219,7 @@ def skeleton(chain: Chain, q: np.ndarray) -> np.ndarray:
 
 
 def thinned(t: np.ndarray, rate: float = FRAMES) -> np.ndarray:
-    """Return indices of samples at about `rate` [Hz], including the last sample.
-
-    Args:
-        t: (N,) times of the samples [s].
-        rate: desired rate.
-    """
+    """Return indices of samples about 1 / `rate` apart, including the last sample, to draw fewer of them."""
     step = 1
     if len(t) > 1:
         period = float(np.median(np.diff(t)))

@@ -110,7 +110,12 @@ def _robot(folder: Path, robot: str | None) -> tuple[Chain | Drawn | None, Path 
 
 
 def _meshes(chain: Chain | Drawn | None, source: Path | None) -> tuple[list[Visual], list[str]]:
-    """Return the meshes of the moving links, and a note if mesh files are missing."""
+    """Return the meshes of the moving links, and a note if mesh files are missing.
+
+    Args:
+        chain: the robot; None: unknown.
+        source: file of the robot's description; without a URDF of a serial arm there are no meshes.
+    """
     if not isinstance(chain, Chain) or source is None or not is_urdf(source) or not chain.links:
         return [], []
     meshes, missing = visuals(source)
@@ -118,12 +123,14 @@ def _meshes(chain: Chain | Drawn | None, source: Path | None) -> tuple[list[Visu
     moving = [mesh for mesh in meshes if mesh.link in links]
     notes = []
     if missing:
-        notes.append(f"{len(missing)} meshes of {source.name} were not found, e.g. {missing[0]}: links are lines")
+        notes.append(
+            f"{len(missing)} meshes of {source.name} were not found, e.g. {missing[0]}: their links are drawn as lines"
+        )
     return moving, notes
 
 
 def visuals(path: str | Path) -> tuple[list[Visual], list[str]]:
-    """Return the meshes of a URDF's ``<visual>`` elements, and the names of missing files.
+    """Return the meshes of a URDF's ``<visual>`` elements, and the names of missing mesh files, for the URDF at `path`.
 
     The XML is not parsed by yourdfpy, which raises an error (ValueError, TypeError) for a file with a capsule or with a
     ``<visual>`` without geometry. ``package://`` is resolved as for collision shapes, see `find_mesh`.
@@ -145,6 +152,10 @@ def visuals(path: str | Path) -> tuple[list[Visual], list[str]]:
 def _errors(folder: Path, chain: Chain | Drawn | None) -> tuple[list[Measured], list[ErrorSizes]]:
     """Return the errors of a fit's rows and of a session's held-out poses.
 
+    Args:
+        folder: folder of a fit or of a session.
+        chain: the robot that is drawn; None: unknown.
+
     Returns:
         Errors with positions in the arm's base frame, and errors of which only the magnitudes are known.
     """
@@ -161,8 +172,13 @@ def _errors(folder: Path, chain: Chain | Drawn | None) -> tuple[list[Measured], 
 
 
 def _measured(folder: Path, chain: Chain | Drawn | None) -> Measured:
-    """Return the measured positions in ``residuals.csv``, with the predictions of the nominal and
-    the calibrated arm.
+    """Return the measured positions in ``residuals.csv``, with the predictions of both arms.
+
+    The arms are the nominal and the calibrated one.
+
+    Args:
+        folder: folder of the fit.
+        chain: the robot that is drawn; None: unknown.
     """
     if isinstance(chain, Drawn):
         return Measured(*chain.measured(folder))
@@ -196,7 +212,12 @@ def _measured(folder: Path, chain: Chain | Drawn | None) -> Measured:
 
 
 def _unplaced(folder: Path, chain: Chain | Drawn | None) -> list[ErrorSizes]:
-    """Return the errors of those rows of ``residuals.csv`` that have no position in the arm's base frame, by kind."""
+    """Return the errors of those rows of ``residuals.csv`` that have no position in the arm's base frame, by kind.
+
+    Args:
+        folder: folder of the fit.
+        chain: the robot that is drawn; None: unknown.
+    """
     if isinstance(chain, Drawn):
         return []
     cell = installation.read(folder)
@@ -214,15 +235,25 @@ def _unplaced(folder: Path, chain: Chain | Drawn | None) -> list[ErrorSizes]:
 
 
 def _is_placed(table: Table, cell: Installation) -> np.ndarray:
-    """Return flags (m,): whether a row of ``residuals.csv`` has a measured position and a station whose pose the fit
-    contains.
+    """Return flags (m,): whether a row's error can be drawn as an arrow at the measured position.
+
+    This requires a measured position and a station whose pose the fit contains.
+
+    Args:
+        table: content of ``residuals.csv`` (m rows).
+        cell: the calibrated arm with the poses of stations and tools.
     """
     has_position = ~np.isnan(table.numbers("dx", "length", gaps=True))
     return has_position & np.isin(table.texts("station"), cell.station_names)
 
 
 def _with_unseen(fitted: Measured, errors: Path) -> Measured:
-    """Return the fitted poses, followed by the held-out poses of a session if there is a file of their errors."""
+    """Return the fitted poses, followed by the held-out poses of a session if there is a file of their errors.
+
+    Args:
+        fitted: the poses of the fit.
+        errors: path of the file of held-out poses; it need not exist.
+    """
     if not errors.is_file():
         return fitted
     table = read_table(errors)
@@ -246,24 +277,49 @@ def _with_unseen(fitted: Measured, errors: Path) -> Measured:
 
 
 def _points(cell: Installation, q: np.ndarray, station: int, tool: int) -> np.ndarray:
-    """Return the tool's positions (m, 3) [m] in the station's frame at joint values q (m, n), deflections included."""
+    """Return the tool's positions (m, 3) [m] in the station's frame at joint values q (m, n), deflections included.
+
+    Args:
+        cell: arm, stations and tools.
+        q: joint values [rad or m].
+        station, tool: indices (from 0) of the station and of the tool.
+    """
     return see(cell, q, station, tool).point.T
 
 
 def _joint_values(table: Table, cell: Installation) -> np.ndarray:
-    """Return the joint values (m, n) [rad or m] in ``residuals.csv``."""
+    """Return the joint values (m, n) [rad or m] in ``residuals.csv``.
+
+    Args:
+        table: content of the file.
+        cell: the arm, whose joint names are the columns' names.
+    """
     return np.column_stack([table.numbers(joint.name, "joint") for joint in cell.chain.joints])
 
 
 def _triples(table: Table, head: str, dimension: str) -> np.ndarray:
-    """Return three columns of a table, named `head` followed by x, y, z, as an array (m, 3) in SI;
-    NaN for empty cells.
+    """Return three columns of a table, named `head` followed by x, y, z, as an array (m, 3) in SI units.
+
+    Empty cells are NaN.
+
+    Args:
+        table: the table.
+        head: beginning of the columns' names.
+        dimension: kind of quantity, such as "length", by which the column's unit is converted.
     """
     return np.column_stack([table.numbers(f"{head}{axis}", dimension, gaps=True) for axis in "xyz"])
 
 
 def _plans(paths: list[Path], chain: Chain | Drawn | None) -> tuple[list[tuple[str, np.ndarray]], list[Played]]:
-    """Return the lists of poses (name and joint values), and the runs through poses; both are empty without a robot."""
+    """Return the lists of poses, and the measuring runs through poses, that CSV files contain.
+
+    Args:
+        paths: the CSV files.
+        chain: the robot; None: unknown, and both results are empty.
+
+    Returns:
+        Name and joint values (m, n) of each list, and the runs.
+    """
     chosen = []
     runs = []
     if chain is None:
@@ -279,7 +335,7 @@ def _plans(paths: list[Path], chain: Chain | Drawn | None) -> tuple[list[tuple[s
 
 
 def is_run(path: Path) -> bool:
-    """Return whether a CSV file contains a measuring run, which has times, instead of a list of poses."""
+    """Return whether the CSV file `path` contains a measuring run, which has times, instead of a list of poses."""
     with path.open(encoding="utf-8", errors="replace") as file:
         return file.readline().startswith(("t [s],pose,", "t,pose,"))
 
@@ -320,8 +376,13 @@ def _motions(folder: Path) -> list[Played]:
 
 
 def _all_torques(folder: Path, chain: Chain | Drawn | None) -> list[Torques]:
-    """Return the measured and predicted torques in a folder and its subfolders; only held-out
-    motion if there is any.
+    """Return the measured and predicted torques in a folder and its subfolders.
+
+    If there is held-out motion, only its torques are returned.
+
+    Args:
+        folder: the folder.
+        chain: the robot, which names the torques; None: unknown.
     """
     result = []
     for path in _below(folder, "torques_*.csv"):
@@ -385,8 +446,9 @@ def _model_rows(model: dict, chain: Chain | Drawn, count: int) -> tuple[tuple[st
 
 
 def _below(folder: Path, pattern: str) -> list[Path]:
-    """Return the files that match a pattern in a folder and in subfolders down to two levels, the
-    folder's files first.
+    """Return the files that match a pattern in a folder and in subfolders down to two levels.
+
+    Files of the folder itself are first.
     """
     paths = []
     for subfolders in ("", "*/", "*/*/"):
@@ -395,7 +457,7 @@ def _below(folder: Path, pattern: str) -> list[Path]:
 
 
 def _label(path: Path, folder: Path) -> str:
-    """Return the name under which the viewer shows a file of a folder or of its subfolders."""
+    """Return the name under which the viewer shows the file `path`, which is in `folder` or in a subfolder of it."""
     parent = path.parent
     if parent == folder:
         return path.stem

@@ -152,7 +152,7 @@ def evaluate(deflection: Deflection, q: np.ndarray, torque: np.ndarray | None = 
     if lever_terms:
         chain = deflection.reference
         if chain is None:
-            raise CalibError("sag terms need the chain that levers are taken from (reference)")
+            raise CalibError("sag terms need reference, the chain from which lever arms are computed")
         gravity = chain.gravity / np.linalg.norm(chain.gravity)
         # (z × u) · ĝ = (ĝ × z) · u
         gravity_cross_axis = np.cross(gravity, np.moveaxis(sweep(chain, q).directions, 1, -1))
@@ -467,7 +467,9 @@ def _deflection(table: ParsedTable, chain: Chain, where: str) -> Deflection:
         check_keys(entry, ("element", "basis", "joint", "order", "coefficient"), where)
         for key, names in (("element", chain.names), ("joint", chain.joint_names)):
             if entry.get(key) not in names:
-                refuse_robot(where, f"{key} {entry.get(key)!r} does not exist in the robot")
+                refuse_robot(
+                    where, f"{key} {entry.get(key)!r} does not exist in the robot; correct or remove this entry"
+                )
         source = chain.joint_names.index(entry["joint"])
         terms.append(Term(entry["element"], entry.get("basis", ""), source, int(entry.get("order", 0))))
         coefficients.append(number(entry.get("coefficient"), f"{where}, coefficient"))

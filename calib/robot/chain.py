@@ -226,7 +226,9 @@ class Chain:
         if isinstance(values, Mapping):
             unknown = set(values) - set(self.names)
             if unknown:
-                raise RobotError(f"robot '{self.name}' has no element '{sorted(unknown)[0]}'")
+                raise RobotError(
+                    f"robot '{self.name}' has no element '{sorted(unknown)[0]}': give one of its element names"
+                )
             values = np.array([values.get(element.name, element.value) for element in self.elements])
         elements = []
         for element, value in zip(self.elements, values, strict=True):

@@ -396,7 +396,7 @@ def _shape(node: Node | None, folders: Sequence[Path], missing: list[str], where
     """
     kind = node.children[0] if node is not None and node.children else None
     if kind is None:
-        refuse_robot(where, "<collision> without a shape")
+        refuse_robot(where, "<collision> without a shape: add a <geometry>")
     if kind.tag == "mesh":
         return _hull(kind, folders, missing, where)
     if kind.tag == "box":

@@ -291,7 +291,7 @@ def from_elements(table: Mapping[str, object], where: str) -> Chain:
     file = parse(ElementsFile, table, where, RobotError)
     for key, entries in (("joint", file.joint), ("element", file.element)):
         if not entries:
-            refuse_robot(where, f"no [[{key}]] tables found")
+            refuse_robot(where, f"no [[{key}]] tables found; a robot needs one per {key}")
     joints = []
     for entry in file.joint:
         limits = {key: getattr(entry, key) for key in tables.LIMITS}

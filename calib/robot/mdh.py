@@ -184,7 +184,7 @@ def chain(name: str, rows: Sequence[Row], propose_beta: bool = True, **fields: A
         owner += row.kind != "fixed"
     massless = [row.name for row in moving if row.inertia is None]
     if massless and len(massless) < len(moving):
-        refuse_robot(f"robot '{name}'", f"row '{massless[0]}' has no inertia while others have")
+        refuse_robot(f"robot '{name}'", f"row '{massless[0]}' has no inertia while others have: state all, or none")
     inertias = None
     if not massless:
         inertias = np.array([row.inertia for row in moving], dtype=float)
@@ -203,7 +203,9 @@ def rows(chain: Chain) -> tuple[Row, ...]:
         match = _ELEMENT.fullmatch(element.name)
         plain = element.placement is None and element.sign == 1.0 and element.ratio == 1.0
         if not match or not plain or AXES[match[1]] != element.axis:
-            raise RobotError(f"robot '{chain.name}' is not an MDH table: element '{element.name}' does not fit")
+            raise RobotError(
+                f"robot '{chain.name}' is not an MDH table: element '{element.name}' does not fit; export it as a URDF"
+            )
         groups.setdefault(int(match[2]), []).append(element)
     result = tuple(_regroup(chain, index, group) for index, group in groups.items())
     owner = 0
@@ -212,7 +214,10 @@ def rows(chain: Chain) -> tuple[Row, ...]:
         expected += _elements(row, row.beta, owner)
         owner += row.kind != "fixed"
     if tuple(expected) != chain.elements:
-        raise RobotError(f"robot '{chain.name}' is not an MDH table: its elements do not form complete rows in order")
+        raise RobotError(
+            f"robot '{chain.name}' is not an MDH table: its elements do not form complete rows in order; export it "
+            "as a URDF"
+        )
     return result
 
 

@@ -70,7 +70,7 @@ class PlacementTable:
         rotation = result[:3, :3]
         error = np.abs(rotation.T @ rotation - np.eye(3)).max()
         if not error < 1e-6 or np.linalg.det(rotation) < 0:
-            refuse_robot(where, f"the upper left 3 x 3 of matrix is not a rotation (R'R - 1 = {error:.2g})")
+            refuse_robot(where, f"the upper left 3 x 3 of matrix is not a rotation (R'R - 1 = {error:.2g}): correct it")
         return result
 
 

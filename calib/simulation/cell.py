@@ -31,7 +31,7 @@ from calib.robot.kinematics import gravity_torques
 from calib.simulation.unmodelled import PositionErrors, displacements, drooping
 from calib.transforms import invert, pose
 
-# pose lists that a session plans, and the names of their measurements
+# Names of the pose lists that a session plans, each with the name under which its measurement is stored.
 PLANS = (("poses", "measured"), ("validation_poses", "validation_measured"))
 
 
@@ -112,12 +112,15 @@ def measure(
         warm: number of poses to which the arm has moved before; infinite for a warm arm.
 
     Returns:
-        Poses (or positions), with the sigmas that the instrument's maker states, drift and outliers not included.
+        Poses, or positions if the instrument measures points only, with the sigmas that the instrument's maker states.
+        These sigmas do not include drift and outliers.
     """
     rng = np.random.default_rng(seed)
     instrument = cell.instrument
-    measured = _noisy(true_poses(cell, q, warm=warm), instrument, rng)
-    sigma, sigma_rotation = _stated(instrument, np.zeros((len(q), 3)))
+    true = true_poses(cell, q, warm=warm)
+    measured = _noisy(true, instrument, rng)
+    no_lever = np.zeros((len(q), 3))
+    sigma, sigma_rotation = _stated(instrument, no_lever)
     if instrument.base_frame is not None:
         base = cell.truth.stations[0] @ instrument.base_frame
         base_poses = np.broadcast_to(base, measured.shape)
@@ -200,11 +203,15 @@ def write_measured(measured: Positions, path: str | Path, degrees: bool = True) 
         path: path of the file.
         degrees: False for SI units throughout.
     """
-    angle, length = 1.0, 1.0
-    angle_unit, length_unit = "rad", "m"
+    angle = 1.0
+    length = 1.0
+    angle_unit = "rad"
+    length_unit = "m"
     if degrees:
-        angle, length = 180.0 / np.pi, 1e3
-        angle_unit, length_unit = "deg", "mm"
+        angle = 180.0 / np.pi
+        length = 1e3
+        angle_unit = "deg"
+        length_unit = "mm"
     header = [f"{name} [{angle_unit}]" for name in measured.joint_names]
     header += [f"{axis} [{length_unit}]" for axis in "xyz"]
     columns = [angle * measured.q, length * measured.position]
@@ -226,9 +233,11 @@ def write_log(recording: Recording, path: str | Path, degrees: bool = True) -> P
 
     Seven digits, as controllers log.
     """
-    angle, angle_unit = 1.0, "rad"
+    angle = 1.0
+    angle_unit = "rad"
     if degrees:
-        angle, angle_unit = 180.0 / np.pi, "deg"
+        angle = 180.0 / np.pi
+        angle_unit = "deg"
     series = [("q", angle * recording.q, angle_unit), ("tau", recording.effort, "Nm")]
     if recording.tau_link is not None:
         series.append(("tau_link", recording.tau_link, "Nm"))

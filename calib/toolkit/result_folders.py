@@ -16,8 +16,8 @@ from calib.procedure.kinematic_stage.inputs import read_file as read_measured_fi
 from calib.procedure.kinematic_stage.metrics import ComparedRows, FitMetrics, ValidationMetrics
 from calib.procedure.kinematic_stage.settings import FitSettings
 from calib.procedure.robot_kinds import joints_of, stage_of
-from calib.results.registry import drawn, open_result
 from calib.results.result import Result, StoredResult
+from calib.results.result_classes import drawn, open_result
 from calib.results.scene import Drawn as DrawnRobot
 from calib.results.scene import ErrorSizes, Measured, Played, Scene, Torques, skeleton, strips, thinned
 

@@ -36,17 +36,21 @@ class Workers:
     """Runner of many parallel tasks, created by the function `workers`.
 
     Attributes:
-        here: whether tasks run with the current folder of this process.
+        here: whether tasks run on this computer, with the current folder of this process.
     """
 
     _stream: Stream
     here: bool = True
 
     def completed(self, function: Callable[..., Any], tasks: Iterable[object]) -> Iterator[tuple[int, Any]]:
-        """Yield the number of a task and its result, in the order of completion; tasks are read from the iterable as
-        needed.
+        """Yield the number (from 0) of each task and its result, in the order of completion.
 
-        The result of a task that was lost repeatedly is a `TaskLost`. An exception in a task is raised.
+        Tasks are read from the iterable as needed. The result of a task that was lost repeatedly is a `TaskLost`. An
+        exception in a task is raised.
+
+        Args:
+            function: function of one task; must be picklable.
+            tasks: the tasks.
         """
         with closing(self._stream(function, ((task,) for task in tasks), lambda number: True)) as answers:
             for number, result, error in answers:
@@ -55,9 +59,13 @@ class Workers:
                 yield number, result if error is None else error
 
     def map(self, function: Callable, *items: Iterable[object]) -> Iterator[Any]:
-        """Yield results in the order of the tasks, like the builtin `map`.
+        """Yield function(*item) for the items in their order, like the builtin `map`.
 
         After Ctrl-C, the available results are yielded, and then KeyboardInterrupt is raised.
+
+        Args:
+            function: the function; must be picklable.
+            *items: one iterable for each argument of the function.
 
         Raises:
             TaskLost: instead of a lost result.

@@ -36,8 +36,9 @@ class _Cluster:
         return self._threads() - len(self.under_way)
 
     def _threads(self) -> int:
-        """Return the number of threads of all workers (1 without workers); the scheduler is asked at most once per
-        second.
+        """Return the number of threads of all workers (1 without workers).
+
+        The scheduler is asked at most once per second.
 
         Raises:
             CalibError: if there have been no workers for `NO_WORKERS` seconds.
@@ -49,11 +50,14 @@ class _Cluster:
             if threads:
                 self.manned = time_now
             elif time_now > self.manned + NO_WORKERS:
-                raise CalibError(f"the Dask scheduler at {self.address} has had no workers for {NO_WORKERS:g} s")
+                raise CalibError(
+                    f"the Dask scheduler at {self.address} has had no workers for {NO_WORKERS:g} s: start workers, "
+                    "then repeat the command"
+                )
         return self.threads
 
     def _said(self, ask: Callable[[], T]) -> T:
-        """Return the result of a function that asks the scheduler.
+        """Return the result of `ask`, a function without arguments that asks the scheduler.
 
         Raises:
             CalibError: if the scheduler does not answer.
@@ -98,7 +102,13 @@ class _Cluster:
         yield self.under_way.pop(future.key)[0], result, raised
 
     def _failed(self, error: Exception) -> Exception:
-        """Return the exception that is reported as the result of a task if Dask, and not the task, has failed."""
+        """Return the exception to report as the result of a task that Dask could not run.
+
+        Exceptions of the task itself are results and are not passed to this function.
+
+        Args:
+            error: exception that Dask raised.
+        """
         from distributed import KilledWorker  # pyright: ignore[reportMissingImports]
 
         if isinstance(error, KilledWorker):
@@ -132,7 +142,9 @@ def _on_cluster(call: bytes) -> bytes:
 
 
 async def _answers(address: str) -> None:
-    """Check that a Dask scheduler answers within `ANSWER` seconds; Dask's client would wait forever for a silent port.
+    """Check that a Dask scheduler answers at `address` within `ANSWER` seconds.
+
+    Dask's client would wait forever for a port that accepts connections but does not answer.
 
     Raises:
         OSError: without an answer.
@@ -150,7 +162,7 @@ async def _answers(address: str) -> None:
 def dask(address: str) -> Iterator[_Cluster]:
     with refused_as(UsageError, ImportError, "a Dask scheduler needs Dask: pip install 'armature-calib[cluster]'"):
         from distributed import Client  # pyright: ignore[reportMissingImports]
-    with refused_as(UsageError, (OSError, ValueError), f"no Dask scheduler answers at {address}: {{}}"):
+    with refused_as(UsageError, (OSError, ValueError), f"no Dask scheduler answers at {address}: {{}}; is it running?"):
         with ThreadPoolExecutor(1) as executor:  # a notebook has a loop of its own
             executor.submit(asyncio.run, _answers(address)).result()
         client = Client(address, timeout=ANSWER, set_as_default=False)

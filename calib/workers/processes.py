@@ -76,8 +76,8 @@ def streamed(crew: Crew, function: Callable, tasks: Iterable[tuple], near: Calla
     Args:
         crew: runner of the tasks.
         function: function that each task calls.
-        tasks: arguments of the function for each task.
-        near: function that returns whether a task with this number may be started already.
+        tasks: for each task, the tuple of the function's arguments.
+        near: function of a task's number (from 0) that returns whether the task may be started already.
 
     Raises:
         RuntimeError: if the runner is in use.
@@ -257,13 +257,14 @@ class Processes:
         if self.stillborn < ATTEMPTS * self.count or self.stopping:
             return NotBegun()
         raise CalibError(
-            f"worker processes die at start ({how}): not enough memory, or the calling script lacks "
-            'if __name__ == "__main__"'
+            f"worker processes die at start ({how}): is memory short, or does the calling script lack "
+            'if __name__ == "__main__"?'
         )
 
     def settled(self) -> Iterator[Answer]:
-        """Yield the answers of tasks that end after Ctrl-C; worker processes that did not receive
-        it are interrupted.
+        """Yield the answers of tasks that end after Ctrl-C.
+
+        Worker processes that did not receive the Ctrl-C are interrupted.
         """
         self.stopping = True
         for patience in (GRACE, 2 * GRACE):
@@ -296,8 +297,9 @@ class Processes:
 
 
 def _serve(pipe: connection.Connection) -> None:
-    """Run the calls that a worker process receives, until the pipe is closed; Ctrl-C has an effect
-    only during a call.
+    """Run the calls that a worker process receives through `pipe`, until the pipe is closed.
+
+    Ctrl-C has an effect only during a call.
     """
     heard = list[int]()
 
@@ -323,7 +325,11 @@ def _serve(pipe: connection.Connection) -> None:
 
 
 def _unheard(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Suppress the message of a Ctrl-C inside a library's callback, where Python cannot raise KeyboardInterrupt."""
+    """Suppress the message of a Ctrl-C inside a library's callback, where Python cannot raise KeyboardInterrupt.
+
+    Args:
+        unraisable: Python's description of the exception; other exceptions are reported as usual.
+    """
     if not isinstance(unraisable.exc_value, KeyboardInterrupt):
         sys.__unraisablehook__(unraisable)
 

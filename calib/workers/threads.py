@@ -25,8 +25,9 @@ _calls = 0
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Limit BLAS to one thread within the block; when the last of nested or parallel blocks ends, restore the old
-    number.
+    """Limit BLAS to one thread within the block, and restore the earlier number of threads afterwards.
+
+    Of nested or parallel blocks, the last one to end restores the number.
     """
     global _calls
     with _changing:
@@ -44,7 +45,11 @@ def one_blas_thread() -> Iterator[None]:
 
 
 def limited_steps(steps: Generator[object, Never, object]) -> Iterator[object]:
-    """Yield the values of a generator, with one BLAS thread inside the generator and the caller's number outside."""
+    """Yield the values of a generator, with one BLAS thread inside the generator and the caller's number outside.
+
+    Args:
+        steps: the generator.
+    """
     ended = object()
     with closing(steps):
         while True:
@@ -94,7 +99,7 @@ def _limit_for_good() -> None:
 
 
 def _set(threads: dict["LibController", int]) -> None:
-    """Set the numbers of threads of libraries; this works from any thread.
+    """Set the number of threads of each BLAS library to the given value; this works from any thread.
 
     threadpoolctl 3.8 accepts settings only from its controlling thread, unless this thread is cleared before.
     """

@@ -58,7 +58,7 @@ from calib.trajectories.design.search import STAGES, Method, SearchResult, Stage
 from calib.trajectories.design.starts import random_start
 from calib.trajectories.design.verify import dense_motion, ensured
 from calib.trajectories.fourier import fourier_family
-from calib.trajectories.places import Workspace
+from calib.trajectories.workspace_limits import Workspace
 
 FC = (11.9, 11.5, 8.98, 8.35, 8.31, 4.72, 6.04)  # [N m], Jubien, Gautier & Janot 2014 as quoted in public code
 FV = (14.4, 15.3, 6.55, 11.0, 4.29, 2.26, 1.6)  # [N m s/rad]

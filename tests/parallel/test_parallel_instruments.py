@@ -148,8 +148,8 @@ def test_impossible_simulation_is_said():
         ({"method": "ekf"}, r"parallel robots take ols, wls.*iv, didim, pc-iv, pc-didim, cloe, clie"),
         ({"method": "cloe", "rows": "power"}, r"rows = 'power' is not supported"),
         ({"method": "gtls"}, "differentiates the torques of a serial arm"),
-        ({"rows": "power"}, r"rows = 'power' is not supported; methods that do: ols, wls"),
-        ({"loop": None}, r"needs a \[loop\]|state the controller"),
+        ({"rows": "power"}, r"rows = 'power' is not supported; methods that support it: ols, wls"),
+        ({"loop": None}, r"needs a \[loop\]|needs the closed loop"),
     ],
 )
 def test_methods_need_a_simulation(more, said):

@@ -13,7 +13,7 @@ from calib.poses.design import Pool, best_addition, design_of, gains_of, with_ad
 from calib.poses.errors import BadInput, NothingFeasible, NotIdentifiable, TooFewCandidates
 from calib.poses.exchange import detmax, exchanged, greedy
 from calib.poses.indices import observability
-from calib.poses.information import prepared
+from calib.poses.scaled_jacobians import prepared
 from calib.poses.select import SearchSettings, random_baseline, select_poses
 
 ARM = library_arm.jacobian(library_arm.random_poses(400, 0))

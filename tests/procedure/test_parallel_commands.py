@@ -219,7 +219,7 @@ NOT_THERE = ("empty.csv", "absent/load.csv", "--options", "options.toml", "--no-
         *((words, 2, said) for words, said in (
         (("identify", "dualv", "three.csv"), "3 joints"),
         (("identify", "dualv", "swapped.csv"), "swapped.csv: sample 1: the loops"),
-        (("identify", "dualv", "load.csv", "--method", "didim"), "state the controller"),
+        (("identify", "dualv", "load.csv", "--method", "didim"), "needs the closed loop"),
         (("identify", "dualv", "load.csv", "--friction", "stribeck"), "standard friction only"),
         (("fit", "dualv", "passive.csv"), "passive joint"),
         (("fit", "dualv", "three.csv"), "'motor1' is missing"),

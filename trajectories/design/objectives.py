@@ -44,7 +44,7 @@ class Value(NamedTuple):
         by_motion: (4, N, n) gradient by q, v, a, jerk; None where the objective does not depend on them.
         by_duration: gradient by the duration of the motion [1/s].
         exact: value of the objective without smoothing.
-        by_information: (c, c) gradient ∂F/∂M of an index of the information matrix; empty for other objectives.
+        by_information: (c, c) gradient of an excitation index by the information matrix; empty for other objectives.
     """
 
     value: float
@@ -60,7 +60,7 @@ class Observed(NamedTuple):
 
     Attributes:
         W: (n N, c) weighted observation matrix, joint after joint.
-        M: (c, c) information matrix Wᵀ W + M_existing.
+        M: (c, c) information matrix Wᵀ W, plus that of motions recorded before.
         shape: shape (N, n, b) of the regressor.
         sigmas: (n,) standard deviations of the torques; None takes 1.
         columns: indices of the regressor's b columns that are in W.
@@ -73,9 +73,12 @@ class Observed(NamedTuple):
     columns: np.ndarray | slice
 
     def by_regressor(self, by_information: np.ndarray) -> np.ndarray:
-        """Return the gradient ∂F/∂regressor (N, n, b) = 2 W S, divided by the sigmas.
+        """Return the gradient (N, n, b) of an excitation index by the regressor, from that by the information matrix.
 
-        S = ∂F/∂M (c, c) is symmetric.
+        With W the observation matrix, it is 2 W S, divided by the standard deviations `sigmas`.
+
+        Args:
+            by_information: S (c, c), symmetric gradient of the index by the information matrix.
         """
         count, n, b = self.shape
         slope = np.zeros((b, n, count))
@@ -92,8 +95,9 @@ class Excitation:
 
     Attributes:
         index: "cond", "logdet", "smallest" or "trace".
-        scaling: "raw", "normalised", or (b,) scales by which the columns are divided.
-        sharpness: p of the smoothing; infinite for no smoothing.
+        scaling: "raw", "normalised", or (b,) scales by which the regressor's columns are divided.
+        sharpness: p of the smoothing, which replaces the largest eigenvalue by (Σ λ^p)^(1/p); infinite for no
+            smoothing.
         sigmas: (n,) standard deviations of the torques [N m or N]; None takes 1. An infinite value excludes the rows of
             that joint.
         existing: (b, b) information matrix of motions recorded before, computed with these sigmas; None for no such
@@ -126,13 +130,18 @@ class Excitation:
         return f"{self.index} scaled"
 
     def evaluate(self, motion: SampledMotion, regressor: np.ndarray) -> Value:
-        """Return the index and its gradient with respect to the information matrix, from a regressor (N, n, b)."""
+        """Return the index of a motion and its gradient with respect to the information matrix.
+
+        Args:
+            motion: the motion; not used, since the regressor is given.
+            regressor: (N, n, b) of the motion's N samples.
+        """
         return self.seen(self.observed(regressor))
 
     def observed(self, regressor: np.ndarray) -> Observed:
-        """Return the observation matrix and its information matrix, from a regressor (N, n, b).
+        """Return the weighted observation matrix and its information matrix, from the regressor (N, n, b) of a motion.
 
-        They contain the columns that this objective uses.
+        They contain only the regressor's columns that this objective uses.
         """
         columns = slice(None)
         if self.columns is not None:
@@ -155,11 +164,15 @@ class Excitation:
     def of_information(self, M: np.ndarray) -> tuple[float, np.ndarray, float]:
         """Return the index F of an information matrix M (c, c), its gradient S = ∂F/∂M, and F without smoothing.
 
-        With C = D M D, D = diag(M)^-1/2 (normalised): ∂F/∂M = D S_C D - diag((C S_C)_kk / M_kk).
+        With normalised columns, F is that of C = D M D, D = diag(M)^-1/2. With S_C the gradient by C, ∂F/∂M = D S_C D -
+        diag((C S_C)_kk / M_kk).
         """
         diagonal = np.diag(M)
         if not (diagonal > 0).all():
-            raise NotExciting(f"column {int(np.argmin(diagonal))} of the regressor is zero along the whole motion")
+            raise NotExciting(
+                f"column {int(np.argmin(diagonal))} of the regressor is zero along the whole motion: remove it, or "
+                "move more joints"
+            )
         if self.index == "trace":
             return self._trace(M)
         normalised = isinstance(self.scaling, str) and self.scaling == "normalised"
@@ -187,9 +200,10 @@ class Excitation:
         return value, by_m, exact
 
     def _trace(self, M: np.ndarray) -> tuple[float, np.ndarray, float]:
-        """Return the index log tr(A M⁻¹) / 2, its derivative -M⁻¹ A M⁻¹ / (2 tr) by M, and the unsmoothed index.
+        """Return the index log tr(A M⁻¹) / 2 of M (c, c), its derivative by M, and the unsmoothed index.
 
-        The third value repeats the first, since this index needs no smoothing.
+        The derivative is -M⁻¹ A M⁻¹ / (2 tr(A M⁻¹)). The third value repeats the first, since this index needs no
+        smoothing.
         """
         d = np.diag(M) ** -0.5
         scaled = M * d * d[:, None]
@@ -204,7 +218,11 @@ class Excitation:
         return value, -0.5 * spread @ inverse / trace, value
 
     def _of_spectrum(self, eigenvalues: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the index F and its derivative ∂F/∂λ from the eigenvalues λ, smallest first."""
+        """Return the index F and its derivative ∂F/∂λ from the eigenvalues λ (c,) of the information matrix.
+
+        Args:
+            eigenvalues: λ, smallest first.
+        """
         if self.index == "logdet":
             return -float(np.log(eigenvalues).mean()), -1.0 / eigenvalues / len(eigenvalues)
         low, by_low = _extreme(eigenvalues, -self.sharpness)
@@ -263,8 +281,9 @@ class FrictionCoverage:
 
         F = mean over joints and the four ranges of  (max(0, 1 - share / wanted))²
 
-    Shares are means of logistic memberships of v. High speed: σ((±v - high) / (`width` high)); low speed: σ(±v / w) -
-    σ((±v - low) / w) with w = `width` low.
+    The four ranges of speed are fast and slow, each forward and backward. The share of time in a range is the mean of a
+    smooth (logistic) membership of v. With the logistic function σ, high speed is σ((±v - high) / (`width` high)) and
+    low speed is σ(±v / w) - σ((±v - low) / w), w = `width` low.
 
     Attributes:
         low, high: (n,) speeds [rad/s or m/s], 0 < low < high.
@@ -299,7 +318,11 @@ class FrictionCoverage:
         return Value(value, None, slope, exact=value)
 
     def shares(self, motion: SampledMotion) -> np.ndarray:
-        """Return the unsmoothed shares of time (4, n): fast forward, slow forward, fast backward, slow backward."""
+        """Return the shares of time (4, n) without smoothing: fast forward, slow forward, fast backward, slow backward.
+
+        Args:
+            motion: the motion, whose samples have equal time steps.
+        """
         rows = []
         for v in (motion.v, -motion.v):
             fast = (v > self.high).mean(axis=0)
@@ -324,7 +347,12 @@ Objective = Excitation | TorqueSlack | FrictionCoverage | Duration
 
 
 def information(stacked: np.ndarray, existing: np.ndarray | None = None) -> np.ndarray:
-    """Return M = Wᵀ W + M_existing (b, b) of a stacked W (rows, b); Wᵀ W where `existing` is None."""
+    """Return the information matrix M = Wᵀ W + M_existing (b, b).
+
+    Args:
+        stacked: W (rows, b), the observation matrix.
+        existing: M_existing (b, b), information of motions recorded before; None for no such motions.
+    """
     M = stacked.T @ stacked
     if existing is None:
         return M
@@ -339,16 +367,17 @@ def condition_numbers(
 ) -> dict[str, float]:
     """Return the condition number of the observation matrix with raw and with normalised columns.
 
-    It is computed by SVD of the observation matrix, which is more accurate than by the eigenvalues of M.
+    It is computed by SVD of the observation matrix, which is more accurate than by the eigenvalues of the information
+    matrix.
 
     Args:
-        regressor: (N, n, b).
+        regressor: (N, n, b) of a motion's N samples.
         sigmas: (n,) standard deviations by which the rows are divided; None takes 1.
         existing: (b, b) information matrix of motions recorded before; None for no such motions.
         columns: (c,) indices of the columns to use; None uses all.
 
     Returns:
-        The condition numbers by "raw" and "normalised"; infinite where a column is zero.
+        The condition numbers by "raw" and "normalised"; infinite if a column is zero.
     """
     if sigmas is not None:
         regressor = regressor / sigmas[:, None]
@@ -376,13 +405,16 @@ def _cond(s: np.ndarray) -> float:
 
 
 def _stacked(regressor: np.ndarray) -> np.ndarray:
-    """Return W (n N, b), joint after joint, without a copy where the regressor's memory is ordered (b, n, N)."""
+    """Return the observation matrix W (n N, b), the rows of joint 1 first, from a regressor (N, n, b).
+
+    The result shares the regressor's memory if that is ordered (b, n, N).
+    """
     count, n, b = regressor.shape
     return regressor.transpose(2, 1, 0).reshape(b, n * count).T
 
 
 def _extreme(eigenvalues: np.ndarray, p: float) -> tuple[float, np.ndarray]:
-    """Return log (Σ λ^p)^(1/p) of eigenvalues λ, and its gradient by λ.
+    """Return log (Σ λ^p)^(1/p) of eigenvalues λ (c,), a smoothed log of an extreme eigenvalue, and its gradient by λ.
 
     For p = ∞ the value is the log of the largest λ, for p = -∞ of the smallest.
     """

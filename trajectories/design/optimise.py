@@ -43,7 +43,7 @@ def design(
         method: "slsqp" (Kraft 1988, by SciPy), or by NLopt "auglag" (augmented Lagrangian, Birgin & Martínez 2008, over
             L-BFGS), "mma" or "ccsaq" (sequential convex separable approximations, Svanberg 2002).
         seed: seed of the random starts.
-        guesses: variables (p,) of further start motions; empty for none.
+        guesses: free variables x (p,) of the motion family for further start motions; empty for none.
         map: the builtin, or a parallel map that returns results in order.
         report: called with the number of finished searches, the number of all searches, and a sentence on the best
             merit so far; None for no report.
@@ -79,7 +79,18 @@ def design(
 
 
 class _Starts:
-    """Searches from several start motions, and the results so far; the searches run stage by stage."""
+    """Searches from several start motions, and the results so far; the searches run stage by stage.
+
+    Args:
+        problem: the excitation problem.
+        evaluations: largest number of evaluations per start.
+        method: optimiser, as for `design`.
+        seed: seed of the random starts.
+        map: the builtin, or a parallel map that returns results in order.
+        report: called with the number of finished searches, the number of all searches, and a sentence; None: no
+            report.
+        starts: number of all start motions.
+    """
 
     def __init__(
         self,
@@ -103,7 +114,12 @@ class _Starts:
         self.interrupted = False
 
     def run(self, tasks: list[int | np.ndarray], stages: tuple[Stage, ...]) -> list[SearchResult]:
-        """Run the given stages of the search for each start and return the results that are feasible."""
+        """Run the given stages of the search for each start and return the results that are feasible.
+
+        Args:
+            tasks: for each start, the number of a random start (from 0), or variables (p,) of a motion to start from.
+            stages: the stages to run, in order.
+        """
         fresh = list[SearchResult]()
         search = partial(one_start, self.problem, *self.arguments, stages=stages)
         # a map in other processes may still hand back what it has
@@ -129,7 +145,7 @@ class _Starts:
         return f"best so far {best:.4g}"
 
     def promising(self) -> list[int | np.ndarray]:
-        """Return the variables of the best motions so far, a share `KEPT` of them.
+        """Return the variables (p,) of the best motions so far, the share `KEPT` of all starts.
 
         Feasible motions are ranked by merit; infeasible motions follow, ranked by constraint violation.
         """
@@ -151,7 +167,13 @@ def _kept(starts: int) -> int:
 
 
 def _nothing(problem: ExcitationProblem, stuck: list[Stuck], starts: int) -> NothingFeasible:
-    """Return the error that names the constraint or hard goal violated by the least infeasible motion."""
+    """Return the error of a search without a feasible motion, which names the violated constraint or hard goal.
+
+    Args:
+        problem: the excitation problem.
+        stuck: results of the searches that failed; the least infeasible motion is described.
+        starts: number of start motions, for the message.
+    """
     best = min(stuck, key=lambda start: start.excess)
     motion = stretched(problem.basis().motion(best.x), best.factor)
     if best.excess[0] <= 0.0 and problem.goals:

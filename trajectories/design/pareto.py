@@ -18,9 +18,9 @@ class Front:
     Attributes:
         names: names of the k objectives.
         values: (m, k) unsmoothed objectives of the m motions.
-        found: (m,) search results of the motions.
+        found: (m,) search results that contain the motions.
         best: (m,) True where no other motion dominates: is at least as small in every objective and smaller in one.
-        designed: number of the motion with which the front is compared.
+        designed: index (from 0) of the motion with which the front is compared.
     """
 
     names: tuple[str, ...]
@@ -42,7 +42,13 @@ def proposed_goals(
 ) -> list[tuple[float, SearchResult]]:
     """Return the optimum of each objective alone, with its motion, as initial goals (Kolyubin et al. 2019).
 
-    Arguments are those of `calib.trajectories.design.optimise.design`; `problem` gives family and constraints.
+    Args:
+        problem: family and constraints of the motions; its objectives and goals are ignored.
+        objectives: the objectives to minimise one after the other.
+        starts, evaluations, seed, guesses, map: as for `calib.trajectories.design.optimise.design`.
+
+    Returns:
+        The smallest value of each objective, and the search result that attains it.
     """
     result = []
     for objective in objectives:
@@ -72,7 +78,7 @@ def sweep(
     Args:
         problem: family and constraints of the motions; its objectives and goals are ignored.
         first, second: the two objectives.
-        count: number of bounds, including the two optima.
+        count: number of bounds on the second objective, including its values at the two optima.
         ends: the search results that minimise the first objective alone, and the second alone.
         designed: search result of another motion, which is added to the front for comparison.
         evaluations: largest number of evaluations of each search.
@@ -112,7 +118,13 @@ def sweep(
 
 
 def _of(problem: ExcitationProblem, objectives: Sequence[Objective], run: SearchResult) -> np.ndarray:
-    """Return the unsmoothed values (k,) of the objectives for the motion of a search result."""
+    """Return the unsmoothed values (k,) of the objectives for the motion of a search result.
+
+    Args:
+        problem: family, regressor and times of the motions; its objectives and goals are ignored.
+        objectives: the k objectives.
+        run: the search result.
+    """
     weighted = tuple((objective, 1.0) for objective in objectives)
     spot = replace(problem, objectives=weighted, goals=())
     motion = stretched(spot.basis().motion(run.x), run.factor)

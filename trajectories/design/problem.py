@@ -24,12 +24,12 @@ INSTANTS = 2000  # over a period at which a motion is looked at between its samp
 
 @dataclass(frozen=True, eq=False)
 class AttainmentGoal:
-    """Goal F ≤ goal + weight · γ on an objective F.
+    """Goal F ≤ goal + weight · γ on an objective F, where γ, the largest miss of all goals, is minimised.
 
     Attributes:
         objective: F.
         goal: the value to attain.
-        weight: factor of γ; None takes |goal|; 0 makes the goal hard (a constraint).
+        weight: factor of γ; None takes |goal|, so that γ is a relative miss; 0 makes the goal hard (a constraint).
         words: wording of the goal in messages; empty for a wording made from name and value.
     """
 
@@ -49,9 +49,9 @@ class AttainmentGoal:
         return self.weight
 
     def stated(self, value: float) -> float:
-        """Return F = value in the quantity that the goal's `words` name.
+        """Return the value F of the objective, converted to the quantity that the goal's `words` name.
 
-        It is the mean torque over its limit, a share of time, or F itself.
+        This quantity is the mean torque over its limit, a share of time, or F itself.
         """
         if isinstance(self.objective, FrictionCoverage):
             return self.objective.wanted * (1.0 - float(np.sqrt(value)))  # of its rms shortfall
@@ -60,7 +60,10 @@ class AttainmentGoal:
         return value
 
     def attainment(self, value: float) -> float:
-        """Return the γ at which F = value just meets the goal; for a hard goal −∞ where it is met, else ∞."""
+        """Return the attainment γ, for which the objective's `value` equals goal + weight · γ.
+
+        Negative: the goal is exceeded. For a hard goal, γ is −∞ where the value meets the goal, else ∞.
+        """
         if self.share == 0:
             rounding = 1e-6 * max(abs(self.goal), 1e-3)
             if value <= self.goal + rounding:
@@ -75,7 +78,7 @@ class ExcitationProblem:
 
     Attributes:
         family: the family of motions over one period.
-        regressor: (q, v, a) -> Y (N, n, b).
+        regressor: (q, v, a) -> Y (N, n, b), which maps b dynamic parameters to the joint torques.
         product: derivative product of the regressor, (q, v, a, G (N, n, b)) -> slopes of Σ G · Y in q, v, a.
         objectives: pairs (objective, weight) of the weighted sum to minimise (of a condition number, the logarithm is
             added); ignored where there are goals.
@@ -118,7 +121,7 @@ class ExcitationProblem:
         return self.stretch[0] < self.stretch[1]
 
     def basis(self) -> Basis:
-        """Return the linear map from variables to motion at the sample times, then at the extra times."""
+        """Return the linear map from variables to the motion at the sample times, followed by the extra times."""
         times = np.append(sample_times(self.family.period, self.samples), self.extra)
         return self.family.basis(times)
 
@@ -190,7 +193,7 @@ class Evaluation:
 
     @property
     def rows(self) -> np.ndarray:
-        """Gradients (r, p) of the smoothed constraints."""
+        """Gradients (r, p) of the r smoothed constraints."""
         count = len(self.problem.goals) or 1
         if "_found" in self.__dict__:  # whoever asked for the merit will ask for its gradient
             return self._gradient[count:]
@@ -228,8 +231,9 @@ def evaluate(problem: ExcitationProblem, basis: Basis, y: np.ndarray, sharpness:
     Args:
         problem: the problem.
         basis: result of `ExcitationProblem.basis`.
-        y: the point.
-        sharpness: p of the smoothed excitation indices and ρ of the smoothed constraints.
+        y: (p + 1,) or (p,) the point: x (p,) are the family's free variables.
+        sharpness: exponent p of the smoothed excitation indices, and ρ of the smoothed maximum (1/ρ) log Σ exp(ρ g) of
+            the scaled constraints g.
     """
     x, factor = _variables(problem, y)
     motion = stretched(basis.motion(x), factor)
@@ -244,7 +248,10 @@ def evaluate(problem: ExcitationProblem, basis: Basis, y: np.ndarray, sharpness:
 
 
 def _variables(problem: ExcitationProblem, y: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the family's variables and the factor on the period that the point y contains."""
+    """Return the family's variables x (p,) and the factor on the period from the point y = (x, factor).
+
+    Where the problem fixes the period, y is x alone, and the factor is that of the problem.
+    """
     if problem.free_period:
         return y[:-1], float(y[-1])
     return y, problem.stretch[0]
@@ -261,8 +268,9 @@ def critical_times(
 
     Args:
         problem: the problem.
-        y: (x, factor on the period where the period is free).
-        min_excess: violation from which a constraint is considered, as a share of its scale.
+        y: free variables x (p,) of the family, then the factor on the period where the period is free.
+        min_excess: violation from which a constraint is considered, as a share of its scale. Of such a constraint,
+            instants up to a tenth of the scale below the limit are returned, too.
         constraints: constraints to check; empty checks those of the problem.
         count: number of instants to check.
     """
@@ -283,7 +291,12 @@ def critical_times(
 def _value(objective: Objective, motion: SampledMotion, Y: np.ndarray, observed: dict[_Matrix, Observed]) -> Value:
     """Return an objective's value.
 
-    Excitation indices with equal columns, sigmas and existing information share one observation matrix in `observed`.
+    Args:
+        objective: the objective.
+        motion: the motion.
+        Y: (N, n, b) regressor of the motion.
+        observed: observation matrices formed so far; excitation indices with equal columns, sigmas and existing
+            information share one.
     """
     if not isinstance(objective, Excitation):
         return objective.evaluate(motion, Y)
@@ -298,9 +311,13 @@ def _matrix(objective: Excitation) -> _Matrix:
 
 
 def _summed(problem: ExcitationProblem, values: list[float]) -> tuple[float, np.ndarray]:
-    """Return the weighted sum of the objectives and its gradient (1, k) by their values.
+    """Return the weighted sum of the problem's objectives and its gradient (1, k) by their values.
 
     Of condition numbers, the logarithm is summed.
+
+    Args:
+        problem: the problem, which gives objectives and weights.
+        values: the k values of the objectives.
     """
     is_log = [is_condition(objective) for objective, _ in problem.objectives]
     logs = np.array(is_log)
@@ -319,7 +336,16 @@ def _slope(
     shares: np.ndarray,
     observed: dict[_Matrix, Observed],
 ) -> np.ndarray:
-    """Return the gradients (4, N, n) of Σ shares · objectives by q, v, a, jerk, computed by one derivative product."""
+    """Return the gradients (4, N, n) of Σ shares · objectives by q, v, a, jerk, computed by one derivative product.
+
+    Args:
+        problem: the problem.
+        motion: the motion at the problem's samples.
+        Y: (N, n, b) regressor of the motion.
+        values: values and gradients of the k objectives.
+        shares: (k,) factors of the objectives in the sum.
+        observed: observation matrices of the excitation indices, as formed by `_value`.
+    """
     result = np.zeros((4, *motion.q.shape))
     by_regressor = None
     by_information: dict[_Matrix, np.ndarray] = {}
@@ -343,7 +369,7 @@ def _slope(
 
 
 def _terms(problem: ExcitationProblem) -> list[Objective]:
-    """Return the objectives to evaluate: those of the goals or, without goals, those of the weighted sum."""
+    """Return the objectives to evaluate: those of a problem's goals or, without goals, of its weighted sum."""
     if problem.goals:
         return [goal.objective for goal in problem.goals]
     return [objective for objective, _ in problem.objectives]
@@ -360,7 +386,13 @@ def is_condition(objective: Objective) -> bool:
 
 
 def exact_values(problem: ExcitationProblem, motion: SampledMotion, regressor: np.ndarray) -> np.ndarray:
-    """Return the unsmoothed values (k,) of the objectives, or of the goals' objectives, for a motion."""
+    """Return the unsmoothed values (k,) of a problem's objectives (or of its goals' objectives) for a motion.
+
+    Args:
+        problem: the problem.
+        motion: the motion at N samples.
+        regressor: (N, n, b) of the motion.
+    """
     values = []
     for objective in _terms(problem):
         unsmoothed = _sharpened(objective, np.inf)
@@ -369,9 +401,14 @@ def exact_values(problem: ExcitationProblem, motion: SampledMotion, regressor: n
 
 
 def merit(problem: ExcitationProblem, values: np.ndarray) -> float:
-    """Return the merit to minimise from objective values (k,): γ with goals, else the weighted sum.
+    """Return the merit to minimise from objective values (k,) of a problem.
 
-    In the weighted sum, condition numbers are taken by logarithm.
+    It is γ, the largest relative miss of the goals, for a problem with goals, else the weighted sum. In the weighted
+    sum, condition numbers are taken by logarithm.
+
+    Args:
+        problem: the problem.
+        values: unsmoothed values of the objectives, or of the goals' objectives.
     """
     if problem.goals:
         return max(goal.attainment(value) for goal, value in zip(problem.goals, values))
@@ -380,9 +417,14 @@ def merit(problem: ExcitationProblem, values: np.ndarray) -> float:
 
 
 def unmet(problem: ExcitationProblem, values: np.ndarray) -> tuple[float, AttainmentGoal, float] | None:
-    """Return the relative miss of the hard goal missed most, that goal, and the value of its objective.
+    """Return, of the problem's hard goals, the relative amount by which the worst is missed, that goal, and its value.
 
-    Returns None if all hard goals are met.
+    Args:
+        problem: the problem with its goals.
+        values: (k,) values of the goals' objectives.
+
+    Returns:
+        The miss relative to the goal, the goal, and the value of its objective; None if all hard goals are met.
     """
     worst = None
     for goal, value in zip(problem.goals, values):
@@ -410,9 +452,18 @@ def _by_variables(
     factor: float,
     by_duration: np.ndarray,
 ) -> np.ndarray:
-    """Return gradients (m, p) by the point (x, factor), from gradients (m, 4, N, n) by q, v, a, jerk.
+    """Return the gradients (m, p) of m functions by the variables of the point y = (x, factor on the period).
 
-    The derivatives by the factor are d v/d factor = -v / factor, and correspondingly for a and jerk.
+    The derivatives by the factor are d v/d factor = -v / factor, and correspondingly for a and jerk. Where the period
+    is fixed, the gradients are by x alone.
+
+    Args:
+        problem: the problem, which says whether the period is free.
+        basis: the linear map from x to the motion.
+        motion: the motion with the duration multiplied by `factor`.
+        slopes: (m, 4, N, n) gradients by q, v, a, jerk of this motion.
+        factor: factor on the family's period.
+        by_duration: (m,) gradients by the duration [1/s].
     """
     powers = factor ** np.arange(4)
     in_family_time = slopes

@@ -46,7 +46,7 @@ class Margin:
 
 @dataclass(frozen=True)
 class Verification:
-    """Margins to all constraints, column by column.
+    """Margins to all constraints, one for each column of a constraint (such as one side of one joint's limit).
 
     Attributes:
         margins: one margin per column of every constraint.
@@ -77,7 +77,7 @@ def dense_motion(family: Family, x: np.ndarray, times: np.ndarray, factor: float
 
     Args:
         family: the family of motions.
-        x: (p,) variables.
+        x: (p,) free variables of the family.
         times: (N,) [s].
         factor: factor on the period.
     """
@@ -93,7 +93,7 @@ def verify_motion(
 
     Args:
         family: the family of motions.
-        x: (p,) variables of the motion.
+        x: (p,) free variables of the family for this motion.
         constraints: the constraints to check.
         factor: factor on the family's period.
         instants: number of instants.

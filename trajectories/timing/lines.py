@@ -76,7 +76,14 @@ def line(forward: Forward, jacobian: Forward, start: np.ndarray, goal: np.ndarra
 
 
 def _follow(forward: Forward, jacobian: Forward, start: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Return joint values (m, n) at the tool poses `targets` (m, 4, 4), each solved from the solution before."""
+    """Return joint values (m, n) at the tool poses `targets` (m, 4, 4), each solved from the solution before.
+
+    Args:
+        forward: q (m, n) to tool poses T_base_tool (m, 4, 4).
+        jacobian: q (m, n) to (m, 6, n), [v; ω] of the tool in the base frame.
+        start: (n,) joint values at the first tool pose [rad or m].
+        targets: (m, 4, 4).
+    """
     q = start.copy()
     profile = [start]
     for k, target in enumerate(targets[1:], 1):
@@ -97,9 +104,14 @@ def _follow(forward: Forward, jacobian: Forward, start: np.ndarray, targets: np.
 
 
 def _reach(forward: Forward, jacobian: Forward, q: np.ndarray, remaining: np.ndarray, target: np.ndarray):
-    """Return joint values (n,) at a target pose (4, 4), and the remaining error (6,).
+    """Return joint values (n,) at the tool pose `target` (4, 4), and the remaining error [Δp; Δφ] (6,) [m and rad].
 
-    The solution is the one near the joint values `remaining` (n,).
+    Args:
+        forward: q (m, n) to tool poses T_base_tool (m, 4, 4).
+        jacobian: q (m, n) to (m, 6, n), [v; ω] of the tool in the base frame.
+        q: (n,) joint values from which the iteration starts.
+        remaining: (n,) joint values towards which redundant joints are pulled.
+        target: (4, 4).
     """
     error = np.full(6, np.inf)
     max_step = 0.2  # [rad or m] of a step of any joint

@@ -18,7 +18,7 @@ SAME = 1e-9  # waypoints nearer than this [rad or m] are one
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """A path of n joints as a spline.
+    """A path q = Φ(s) of n joints as a spline, with the path parameter s.
 
     Attributes:
         derivative: (s (N,), order) to (N, n), d^order Φ / ds^order [rad or m per s^order], order 0 to 2.
@@ -54,7 +54,8 @@ def spline(waypoints: np.ndarray, spacing: np.ndarray | None = None, scale: np.n
 
     Args:
         waypoints: (m, n) joint values [rad or m], two or more.
-        spacing: (m - 1,) factors on the chord lengths between knots, which change the shape of the path; None: ones.
+        spacing: (m - 1,) factors on the distances between knots (the chord lengths in joint space), which change the
+            shape of the path; None: ones.
         scale: (n,) length of each joint that enters the chord length as 1 [rad or m]; None: ones.
 
     Raises:
@@ -153,7 +154,12 @@ def extremes(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def reversals(path: Path, s: np.ndarray) -> np.ndarray:
-    """Return the path parameters where a joint reverses (zeros of Φ'_j) between samples s (N,), found by bisection."""
+    """Return the path parameters at which a joint reverses (zeros of Φ'_j = dΦ_j/ds), found by bisection.
+
+    Args:
+        path: the path q = Φ(s).
+        s: (N,) samples; one reversal of each joint is found between neighbours with opposite signs of Φ'_j.
+    """
     slope = path(s, 1)
     k, j = np.nonzero(slope[:-1] * slope[1:] < 0)
     low = s[k]

@@ -16,7 +16,7 @@ TorqueLaw = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """A speed profile along a path: ṡ² at grid points, linear in s between them.
+    """A speed profile along a path with the parameter s: ṡ² at grid points, linear in s between them.
 
     Attributes:
         s: (K + 1,) grid of path parameters, rising from 0.
@@ -34,7 +34,7 @@ class Profile:
 
     @property
     def times(self) -> np.ndarray:
-        """Times (K + 1,) of the grid points [s]: Δt = 2 Δs / (ṡ_k + ṡ_{k+1})."""
+        """Times (K + 1,) [s] at which the motion passes the grid points: Δt = 2 Δs / (ṡ_k + ṡ_{k+1})."""
         speed = np.sqrt(self.x)
         summed_speeds = speed[:-1] + speed[1:]
         durations = 2 * np.diff(self.s) / summed_speeds
@@ -45,11 +45,11 @@ class Profile:
         return float(self.times[-1])
 
     def slower(self, factor: float) -> Profile:
-        """Return the profile slowed down: `factor` times the duration."""
+        """Return the profile slowed down to `factor` times the duration."""
         return Profile(self.s, self.x / factor**2)
 
     def at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return s, ṡ, s̈, each (N,), at times [s]."""
+        """Return path parameter s, speed ṡ and path acceleration s̈, each (N,), at times (N,) [s]."""
         starts = self.times
         interval = np.searchsorted(starts, times, side="right") - 1
         k = np.clip(interval, 0, len(self.s) - 2)
@@ -69,7 +69,8 @@ class Sampled:
     Attributes:
         s: (N,) path parameters of the samples.
         weights: (N,) duration that each sample represents [s]; they sum to the duration of the motion.
-        q, v, a, tau: (N, n) joint values, velocities, accelerations, torques; tau is None where no torque law is given.
+        q, v, a, tau: (N, n) joint values [rad or m], velocities, accelerations, torques [N m or N]; tau is None where
+            no torque law is given.
     """
 
     s: np.ndarray
@@ -81,12 +82,16 @@ class Sampled:
 
 
 def dense(path: Path, profile: Profile, torque: TorqueLaw | None, per_interval: int = 8) -> Sampled:
-    """Return the motion of a profile, sampled densely on each interval.
+    """Return the motion along a path with a given speed profile, sampled densely on each interval of the profile.
 
-    Both ends of an interval are samples, since s̈ and friction jump between intervals.
+    Both ends of an interval are samples, since s̈ and friction jump between intervals. At rest, friction has the
+    direction of the motion that begins or ends at this instant, which gives the larger torque.
 
-    At rest, friction has the direction of the motion that begins or ends at this instant, which gives the larger
-    torque.
+    Args:
+        path: the path.
+        profile: the speed profile along it.
+        torque: (q, v, a) to torques, each (N, n); None computes no torques.
+        per_interval: number of samples on each interval.
     """
     share = np.linspace(1e-6, 1 - 1e-6, per_interval)
     steps = np.diff(profile.s)[:, None]
@@ -108,7 +113,14 @@ def dense(path: Path, profile: Profile, torque: TorqueLaw | None, per_interval: 
 
 
 def moved(path: Path, s: np.ndarray, speed: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return joint values, velocities and accelerations q = Φ, v = Φ' ṡ, a = Φ' s̈ + Φ'' ṡ², each (N, n)."""
+    """Return joint values, velocities and accelerations q = Φ, v = Φ' ṡ, a = Φ' s̈ + Φ'' ṡ², each (N, n).
+
+    Args:
+        path: the path Φ(s), with Φ' = dΦ/ds.
+        s: (N,) path parameters s.
+        speed: (N,) ṡ [unit of s per second].
+        u: (N,) s̈ [unit of s per second²].
+    """
     slope = path(s, 1)
     velocity = slope * speed[:, None]
     acceleration = slope * u[:, None] + path(s, 2) * (speed**2)[:, None]
@@ -116,10 +128,16 @@ def moved(path: Path, s: np.ndarray, speed: np.ndarray, u: np.ndarray) -> tuple[
 
 
 def track(path: Path, profile: Profile, rate: float, torque: TorqueLaw | None = None) -> Setpoints:
-    """Return the motion as setpoints at a controller's rate [Hz].
+    """Return the motion along a path as setpoints at a controller's rate.
 
     The duration must be a whole number of samples. Torques at rest are those just after the start and just before the
-    end. They are None without a torque law.
+    end.
+
+    Args:
+        path: the path.
+        profile: the speed profile along it.
+        rate: sampling rate of the controller [Hz].
+        torque: (q, v, a) to torques, each (N, n); None leaves the torques of the setpoints None.
     """
     count = round(profile.duration * rate)
     times = np.arange(count + 1) / rate

@@ -28,7 +28,8 @@ class Shaped:
     Attributes:
         path: the fastest path.
         phi: (p,) path parameters φ of `path`, each from -1 to 1.
-        before, after: durations [s] at φ = 0 and of `path`.
+        before, after: durations [s] of the path at φ = 0 (the spline through the waypoints without via points), and of
+            `path`.
         evaluations: number of paths timed.
         refused: number of the timed paths that have no timing within the limits.
     """
@@ -42,7 +43,12 @@ class Shaped:
 
 
 def count(waypoints: np.ndarray, stray: float) -> int:
-    """Return the number of path parameters φ."""
+    """Return the number of path parameters φ that change a path: ratios of knot intervals, and offsets of via points.
+
+    Args:
+        waypoints: (m, n) joint values.
+        stray: largest offset of a via point [rad or m]; with 0, via points are not counted.
+    """
     m, n = np.shape(waypoints)
     parameters = m - 2
     if stray > 0:
@@ -51,9 +57,12 @@ def count(waypoints: np.ndarray, stray: float) -> int:
 
 
 def build(waypoints: np.ndarray, phi: np.ndarray, stray: float = 0.0) -> Path:
-    """Return the path for parameters φ.
+    """Return the path through the waypoints for parameters φ, each from -1 to 1.
 
-    φ contains log ratios of knot intervals, then the offsets of the via points as shares of `stray`.
+    Args:
+        waypoints: (m, n) joint values [rad or m].
+        phi: φ (p,), log ratios of knot intervals, then the offsets of the via points as shares of `stray`.
+        stray: largest offset of a via point from the first spline in each joint [rad or m]; 0 for no via points.
     """
     points = checked(waypoints)
     m, n = points.shape
@@ -85,7 +94,7 @@ def shorten(
         timer: function that returns the duration [s] of a path, and raises `NothingFeasible` or `BadInput` where no
             timing exists.
         evaluations: largest number of paths timed.
-        stray: largest distance of a via point from the first spline in each joint [rad or m]; 0 for no via points.
+        stray: largest offset of a via point from the spline of φ = 0, in each joint [rad or m]; 0 for no via points.
         progress: called with the number of evaluations and the best duration [s]; None for no report. Ctrl-C ends the
             search with the best path so far.
 

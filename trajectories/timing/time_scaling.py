@@ -138,7 +138,14 @@ def time_optimal(
 
 
 def _timed(path: Path, limits: TimingLimits, law: Law | None, profile: Profile) -> Timing:
-    """Return the timing of a profile, with its dense samples."""
+    """Return the timing of a path with a given speed profile, with its dense samples.
+
+    Args:
+        path: the path.
+        limits: the limits of velocity, acceleration and torque, to be recorded.
+        law: the robot's dynamics; None computes no torques.
+        profile: the speed profile.
+    """
     torque = None
     if law is not None:
         torque = law.torque
@@ -153,7 +160,13 @@ def _on_samples(profile: Profile, rate: float | None) -> Profile:
 
 
 def _slowed_down(timing: Timing, law: Law | None, rate: float | None) -> Timing | None:
-    """Return the timing slowed down by up to 1 % to satisfy the limits; None if 1 % does not suffice."""
+    """Return the timing slowed down by up to 1 % to satisfy the limits; None if 1 % does not suffice.
+
+    Args:
+        timing: a timing that exceeds its limits slightly.
+        law: the robot's dynamics; None for none.
+        rate: sampling rate of a controller [Hz], to whose samples the duration is rounded up; None does not round.
+    """
     for factor in 1 + 1e-5 * 2.0 ** np.arange(11):
         profile = _on_samples(timing.profile.slower(factor), rate)
         slower = _timed(timing.path, timing.limits, law, profile)
@@ -163,16 +176,22 @@ def _slowed_down(timing: Timing, law: Law | None, rate: float | None) -> Timing 
 
 
 def _per_interval(values: np.ndarray, count: int) -> np.ndarray:
-    """Return the maxima (count, n) over each interval of values (N, n) sampled by `dense`."""
+    """Return the maximum of `values` (N, n) on each of `count` intervals (count, n), for the samples of `dense`."""
     return values.reshape(count, -1, values.shape[1]).max(axis=1)
 
 
 def _round(
     rows: ConstraintRows, law: Law | None, x: np.ndarray | None, before: np.ndarray | None, tight: dict
 ) -> Profile:
-    """Return the fastest profile with friction linearised at the last rounds.
+    """Return the fastest profile with friction linearised at the profiles of the last two rounds.
 
-    Secants are used where tangents make the problem infeasible.
+    Tangents to friction are replaced by secants where tangents make the problem infeasible.
+
+    Args:
+        rows: geometry, dynamics and limits on the grid.
+        law: the robot's dynamics; None for no dynamics.
+        x, before: (K + 1,) ṡ² of the last profile and of the profile before it; None in the first rounds.
+        tight: for each kind of limit, the share (K, n) of the limit that may be used on each interval.
     """
     try:
         bounded = rows.bounded(rows.friction(law, x, before), tight)
@@ -183,7 +202,11 @@ def _round(
 
 
 def _shares(sampled: Sampled, limits: TimingLimits) -> dict[str, np.ndarray]:
-    """Return the shares of the limits in use, (N, n) for each kind of limit that some joint has."""
+    """Return the shares of the limits in use, (N, n) for each kind of limit that some joint has.
+
+    Args:
+        sampled: dense samples of a motion.
+    """
     kinds = (
         ("velocity", sampled.v, limits.velocity),
         ("acceleration", sampled.a, limits.acceleration),
@@ -201,6 +224,10 @@ def _check_holding(path: Path, limits: TimingLimits, law: Law, s: np.ndarray) ->
 
     A fast motion could still pass such a pose. It could neither be stopped there nor be rehearsed at low speed, so it
     is refused (our choice).
+
+    Args:
+        law: the robot's dynamics.
+        s: (N,) path parameters to check.
     """
     slow_speed = np.full(len(s), 1e-9)
     no_acceleration = np.zeros(len(s))
@@ -252,7 +279,11 @@ def _whole(duration: float, rate: float) -> float:
 
 
 def _not_settled(excess: dict[str, np.ndarray]) -> NothingFeasible:
-    """Return the error that the timing did not converge, which names the limit exceeded most."""
+    """Return the error that the timing did not converge, which names the limit exceeded most.
+
+    Args:
+        excess: for each kind of limit, the excess (K, n) as a share of the limit.
+    """
     name = max(excess, key=lambda key: float(excess[key].max()))
     worst = float(excess[name].max())
     by_joint = excess[name].max(axis=0)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from calib import files
-from calib.apps.cell_demo.summary import Telling, row
+from calib.apps.cell_demo.step_lines import Telling, row
 from calib.errors import SessionError, UsageError, command_line
 from calib.folders import read_estimate
 from calib.records import read_lines
@@ -146,7 +146,7 @@ def run(
     cell = virtual_cell(robot, seed)
     if dynamics and cell.nominal.inertias is None:
         supported = ", ".join(name for name in robot_names() if load(name).inertias is not None)
-        say(f"geometry only: masses are known of {supported}")
+        say(f"geometry only: masses are known for {supported} only")
         dynamics = False
     motion: dict[str, Any] = {}
     if dynamics:
@@ -190,7 +190,12 @@ def run(
 
 
 def _stopped(session: Session, waiting: StepState) -> tuple[str, ...]:
-    """Return the engineer's instructions for the step `waiting`, and the commands that simulate it and continue."""
+    """Return the engineer's instructions for the step `waiting`, and the commands that simulate it and continue.
+
+    Args:
+        session: the session.
+        waiting: the step that waits for the engineer.
+    """
     folder = session.folder
     simulate, go_on = command_line("demo", "--bring", folder), command_line("next", folder)
     return *asks(session, waiting), f"(or simulate this step: {simulate}; then: {go_on})"
@@ -200,6 +205,11 @@ def _compare_with_truth(session: Session, cell: Cell, say: Say) -> tuple[float, 
     """Return the rms tool errors [mm] of the nominal and of the calibrated arm against the hidden truth.
 
     All errors are printed, and written to ``truth.txt`` and ``truth.json`` in the session's folder.
+
+    Args:
+        session: the calibrated session.
+        cell: the simulated cell with its true parameters.
+        say: function that prints a line.
     """
     cell_fit = read_installation(session.fit.path)
     urdf = read_calibrated(session.fit.path).chain
@@ -279,7 +289,13 @@ def _cells_of(session: Session) -> tuple[Cell, CameraCell | None]:
 
 
 def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda text: None) -> None:
-    """Simulate the files that the step named `step` waits for."""
+    """Simulate the files that a step of a session waits for, and write them into the session's folder.
+
+    Args:
+        session: the session.
+        step: name of the step.
+        say, progress: functions that print a permanent line, and show a transient status.
+    """
     seed = session.settings.seed
     cell, camera_cell = _cells_of(session)
     if step in ("measure", "validate") and camera_cell is not None:
@@ -300,7 +316,7 @@ def _bring_for(session: Session, step: str, say: Say, progress: Say = lambda tex
 
 
 def arm_of(session: Session, cell: Cell) -> MovingArm:
-    """Return the session's simulated arm with its true dynamics."""
+    """Return the session's simulated arm with its true dynamics, built on the simulated cell `cell`."""
     return moving_arm(cell, session.settings.robot.given, session.settings.seed)
 
 
@@ -308,6 +324,11 @@ def simulate_measurements(session: Session, cell: Cell, seed: int) -> None:
     """Simulate measurements of the planned poses with a drifting CMM, and write them into the session's folder.
 
     The first three poses to fit are measured again at the end, so that the drift can be found.
+
+    Args:
+        session: the session.
+        cell: the simulated cell with its true parameters.
+        seed: seed of the noise and of the drift.
     """
     _mark(session, cell.note)
     for number, name, q in planned_poses(session.folder, cell.nominal):
@@ -343,6 +364,11 @@ def simulate_recordings(session: Session, arm: MovingArm, seed: int) -> None:
     """Simulate torque recordings of the designed motions, without and with each payload.
 
     They are written into the session's folder.
+
+    Args:
+        session: the session.
+        arm: the simulated arm with its true dynamics.
+        seed: seed of the noise.
     """
     payloads = _true_payloads(session)
     payload_notes = [f"; payload '{label}': {payload}" for label, payload in payloads.items()]

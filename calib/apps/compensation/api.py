@@ -26,10 +26,12 @@ class JointCommands(Shown, joint_commands.Commands):
 
     @checked
     def save(self, path: str | Path, *, partial: bool = False, overwrite: bool = False) -> Path:
-        """Write the joint commands as CSV and return its path; with `partial`, also where some targets are not reached.
+        """Write the joint commands as CSV and return its path.
 
-        An existing file that no earlier run of calib wrote, or that was edited since, is replaced only with
-        `overwrite`.
+        Args:
+            path: the CSV file.
+            partial: also write the commands if some targets are not reached.
+            overwrite: also replace a file that no earlier run of calib wrote, or that was edited since.
         """
         with files.results([(Path(path), (".csv",))], overwrite=overwrite):
             return joint_commands.write(self, Path(path), partial)
@@ -79,7 +81,7 @@ def compensate(
             targets give and the arm can reach.
         start: (n,) joint values [rad or m] near which targets without joints are sought; None: the middle of the
             limits.
-        tolerance: largest accepted residual at a target by the calibrated model [m], [rad].
+        tolerance: largest accepted position [m] and orientation [rad] residual at a target, by the calibrated model.
         seed: seed of the starts for targets without joints.
         progress: called with a short text as the computation proceeds; None for no report.
 

@@ -87,7 +87,8 @@ class Fitted:
         cell: the calibrated arm with stations and tools, deflections included.
         nominal: the nominal arm with the stations and tools that fit the measurements best; no stations if these are
             unknown.
-        free, covariance: indices of the fitted parameters and their covariance, as `read_covariance` returns them.
+        free, covariance: indices of the fitted parameters in the cell's parameter vector, and the covariance of small
+            steps along them.
         unseen: rms error of the calibrated arm at held-out poses [m]; None without such poses.
         fitted: rms error at the fitted poses [m]; None where the fit does not contain it.
         fitted_q: (k, n) joint values of the fitted poses [rad or m]; None where the fit does not contain them.
@@ -130,7 +131,7 @@ class Commands:
             model.
         beyond: (m, n) True for joint values outside the range of the fitted poses; all False if the range is unknown.
         dof: number of constrained pose components: 6, 5 or 3.
-        notes: remarks on the frames and on anything unusual.
+        notes: remarks on the frames, and warnings.
         own: (m, 2) part of ``before`` due to the arm alone, with the nominal base placed where it fits the measurements
             best; None where ``before`` is already computed so, or where this placement is unknown.
     """
@@ -189,7 +190,9 @@ def placements(fitted: Fitted, frame: str = "base", tool: str = "flange") -> tup
 
     Args:
         fitted: the calibrated arm and its cell.
-        frame, tool: frame of the targets, and tool at them; the module's docstring lists the choices.
+        frame: frame of the targets: ``base`` (of the calibrated robot), ``nominal``, or the name of a station.
+        tool: what is at the targets: ``flange``, a tool of the fit, or ``x,y,z[,roll,pitch,yaw]`` in the flange [m,
+            rad].
 
     Raises:
         UsageError: a frame or tool that the fit does not have.
@@ -261,8 +264,9 @@ def computed(
     Args:
         fitted: the calibrated arm and its cell.
         targets: joint values or poses.
-        frame, tool: frame of the targets, and tool at them; the module's docstring lists the choices.
-        dof: number of constrained pose components, as for `calib.geometry.inverse.Goal`; None for all that the targets
+        frame, tool: frame of the targets, and tool at them, as for `placements`.
+        dof: number of constrained pose components: 6; 5, free to turn about the tool's z axis; 3, position only; None
+            for all that the targets
             contain and the arm can reach.
         start: (n,) joint values near which targets without joint values are sought [rad or m]; None for the middle of
             the limits.
@@ -284,7 +288,7 @@ def computed(
     goal = Goal(calibrated_cell, count, chain.lower, chain.upper)
     if start is not None and not _inside(nominal_goal, np.asarray(start)):
         limits = f"{chain.lower.tolist()} to {chain.upper.tolist()}"
-        raise UsageError(f"start {list(start)}: outside the joints' limits {limits}")
+        raise UsageError(f"start {list(start)}: outside the joints' limits {limits} [rad, m]: state values within them")
 
     say("the nominal robot at the targets")
     poses, nominal_q = _reference(nominal_goal, targets, start, seed)
@@ -338,6 +342,11 @@ def _followed(goal: Goal, poses: np.ndarray, start: np.ndarray) -> np.ndarray:
     """Return joint values (m, n) near `start` (m, n) that reach the poses (m, 4, 4).
 
     Near a singularity, the motion away from `start` is limited, and the poses may not be reached.
+
+    Args:
+        goal: the arm with tool and joint limits, and the constrained pose components.
+        poses: target poses.
+        start: joint values [rad or m], one row per pose.
     """
     clipped = np.clip(start, goal.lower, goal.upper)
     q = nearest(goal, poses, clipped, reach(goal, poses, start))
@@ -350,7 +359,13 @@ def _followed(goal: Goal, poses: np.ndarray, start: np.ndarray) -> np.ndarray:
 def _dof(targets: Targets, chain: Chain, requested: int | None) -> tuple[int, Finding]:
     """Return the number of constrained pose components (6, 5 or 3), and a finding that states it.
 
-    With `requested` None, all components that the targets contain and the arm can reach are constrained.
+    Args:
+        targets: the targets.
+        chain: the arm.
+        requested: number that the user requested; None: all components that the targets contain and the arm can reach.
+
+    Raises:
+        UsageError: another number, or more components than the targets contain.
     """
     joints_only = targets.q is not None and targets.position is None
     oriented = targets.rotation is not None or joints_only
@@ -372,7 +387,14 @@ def _dof(targets: Targets, chain: Chain, requested: int | None) -> tuple[int, Fi
 
 
 def _reference(goal: Goal, targets: Targets, start: Sequence[float] | None, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the poses (m, 4, 4) of the targets, and the nominal robot's joint values (m, n) there [rad or m]."""
+    """Return the poses (m, 4, 4) of the targets, and the nominal robot's joint values (m, n) there [rad or m].
+
+    Args:
+        goal: the nominal arm with tool and joint limits.
+        targets: joint values or poses.
+        start: (n,) joint values near which targets without joint values are sought; None: the middle of the limits.
+        seed: seed of further starts.
+    """
     if targets.position is None:
         assert targets.q is not None
         return see(goal.cell, targets.q).poses(), np.array(targets.q)
@@ -393,7 +415,13 @@ def _reference(goal: Goal, targets: Targets, start: Sequence[float] | None, seed
 def _sought(goal: Goal, poses: np.ndarray, start: np.ndarray, starts: np.ndarray) -> np.ndarray:
     """Return the nominal robot's joint values (m, n) at the poses.
 
-    Of several solutions, the nearest to `start` (n,) is returned. The search begins at `start` and at each of `starts`.
+    Of several solutions, the nearest to `start` is returned.
+
+    Args:
+        goal: the nominal arm with tool and joint limits.
+        poses: (m, 4, 4) target poses.
+        start: (n,) joint values [rad or m] from which the search begins first.
+        starts: (k, n) further joint values from which it begins.
     """
     best = np.tile(start, (len(poses), 1))
     cost = np.full(len(poses), np.inf)
@@ -421,7 +449,12 @@ def _sizes(difference: np.ndarray) -> np.ndarray:
 
 
 def _within(sizes: np.ndarray, tolerance: tuple[float, float]) -> np.ndarray:
-    """Return whether each row of errors (m, 2) is within the tolerance, (m,) bool; an orientation of NaN always is."""
+    """Return whether each row of errors is within the tolerance, (m,) bool.
+
+    Args:
+        sizes: (m, 2) position [m] and orientation [rad] errors; an orientation error of NaN is within any tolerance.
+        tolerance: largest position [m] and orientation [rad] error.
+    """
     position, turn = sizes.T
     return (position <= tolerance[0]) & ~(turn > tolerance[1])
 
@@ -435,7 +468,17 @@ def _reason(
     residual: np.ndarray,
     singular: bool,
 ) -> str:
-    """Return why a target is not reached; for a reached target, the joints beyond the measured range, else empty."""
+    """Return why a target is not reached; for a reached target, the joints beyond the measured range, else empty.
+
+    Args:
+        chain: the nominal arm.
+        reached: whether the target is reached.
+        extrapolated: (n,) True for joints outside the range of the fitted poses.
+        nominal: (n,) joint values of the nominal robot at the target [rad or m].
+        q: (n,) joint command [rad or m].
+        residual: (2,) position [m] and orientation [rad] errors of the command.
+        singular: whether the command was limited near a singularity.
+    """
     if reached:
         names = [name for name, out in zip(chain.joint_names, extrapolated) if out]
         if not names:
@@ -462,6 +505,12 @@ def _predicted_sigmas(
     """Return the tool's sigmas (m, 2) due to the parameters' covariance, and expected errors (m, 2), as in `Commands`.
 
     A tool whose placement was not fitted counts as exactly known.
+
+    Args:
+        fitted: the calibrated arm and its cell.
+        q: (m, n) joint commands [rad or m].
+        frame, tool: frame of the targets, and tool at them, as for `placements`.
+        goal: the calibrated arm with the tool, and the constrained pose components.
     """
     cell, free, covariance = fitted.cell, fitted.free, fitted.covariance
     if tool in cell.tool_names:
@@ -485,7 +534,14 @@ def _predicted_sigmas(
 
 
 def _frame_note(fitted: Fitted, frame: str) -> Finding:
-    """Return the finding that names the targets' frame, with the distance between the frames base and nominal."""
+    """Return the finding that names the targets' frame.
+
+    It includes the distance between the frames ``base`` and ``nominal``.
+
+    Args:
+        fitted: the calibrated arm and its cell.
+        frame: ``base``, ``nominal``, or the name of a station.
+    """
     if frame not in ("base", "nominal"):
         return finding("targets-in-station", station=frame)
     shift = turn = None
@@ -498,7 +554,12 @@ def _frame_note(fitted: Fitted, frame: str) -> Finding:
 
 
 def _turn_note(fitted: Fitted, dof: int) -> list[Finding]:
-    """Return a finding if orientations are constrained although none was measured for the fit; else an empty list."""
+    """Return a finding if orientations are constrained although none was measured for the fit; else an empty list.
+
+    Args:
+        fitted: the calibrated arm and its cell.
+        dof: number of constrained pose components.
+    """
     table = layout(fitted.cell)
     measured = np.intersect1d(fitted.free, table.index("tool"))
     axes = {table.names[k].rsplit(".", 1)[-1] for k in measured}
@@ -508,7 +569,10 @@ def _turn_note(fitted: Fitted, dof: int) -> list[Finding]:
 
 
 def _unreached(commands: Commands) -> list[str]:
-    """Return one line for each target that is not reached, with the reason; at most `MAX_LISTED` lines."""
+    """Return one line for each target that the joint commands do not reach, with the reason.
+
+    At most `MAX_LISTED` lines are returned.
+    """
     lost = np.flatnonzero(~commands.reached)
     result = [f"target {k + 1}: {commands.reason[k]}" for k in lost[:MAX_LISTED]]
     if len(lost) > MAX_LISTED:
@@ -518,6 +582,10 @@ def _unreached(commands: Commands) -> list[str]:
 
 def write(commands: Commands, out: Path, partial: bool = False) -> Path:
     """Write the commands as CSV (format of `calib.data.poses.pose_lists`) and return its path.
+
+    Args:
+        out: the CSV file.
+        partial: also write the commands if some targets are not reached.
 
     Raises:
         UsageError: no target is reached, or, without `partial`, some are not; nothing is written.
@@ -529,7 +597,7 @@ def write(commands: Commands, out: Path, partial: bool = False) -> Path:
         head = f"{targets.file}: {lost} of {count} targets are not reached; nothing was written"
         message = "\n  ".join([head, *_unreached(commands)])
         if lost != count:
-            message += "\nwith partial (--partial), all other rows are written and these stay empty"
+            message += "\nwith partial (--partial), all other rows are written, and those above stay empty"
         raise UsageError(message)
 
     q = commands.q / (targets.factors or 1.0)
@@ -548,7 +616,13 @@ def write(commands: Commands, out: Path, partial: bool = False) -> Path:
 
 
 def lines(commands: Commands) -> list[str]:
-    """Return the console lines: notes on frames, targets that are not reached, errors before and after compensation."""
+    """Return the console lines on joint commands.
+
+    They are notes on frames, targets that are not reached, and errors before and after compensation.
+
+    Args:
+        commands: the joint commands.
+    """
     reached, targets, fitted = commands.reached, commands.targets, commands.fitted
     result = [*commands.notes, *targets.notes]
     if targets.ignored:
@@ -580,7 +654,7 @@ def lines(commands: Commands) -> list[str]:
 
 
 def _expectation(commands: Commands) -> Finding:
-    """Return the finding on the real arm's expected error at these targets.
+    """Return the finding on the position error to be expected of the real arm at the targets of joint commands.
 
     The error is that of the error model, or, without a model, the rms error at held-out poses.
     """
@@ -598,7 +672,7 @@ def _expectation(commands: Commands) -> Finding:
 
 
 def _rms_pair(errors: np.ndarray) -> str:
-    """Return the rms of errors (m, 2) in position [m] and orientation [rad] as text."""
+    """Return the rms over m targets of position [m] and orientation [rad] errors (m, 2) as text."""
     position, turn = np.sqrt(np.mean(errors**2, axis=0))
     text = f"{1e3 * position:.3g} mm"
     if not np.isnan(turn):

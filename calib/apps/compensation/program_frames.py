@@ -30,12 +30,13 @@ class Statements:
 
     Attributes:
         tool: ``flange`` (the all-zero tool), a tool of the fit, or ``x,y,z[,roll,pitch,yaw]`` in the controller's
-            flange [m, rad]; None: the tool is read from the program.
+            flange [m, rad]; None: the tool of each pose is read from the program.
         user: ``x,y,z[,roll,pitch,yaw]`` of the user frame in the controller's base [m, rad]; None: the frame is read
             from the program.
         world: (4, 4) pose of the controller's base in the arm's base; None: known from the robot's description, or from
             the controller's rule.
-        flange: (4, 4) pose of the controller's flange in the arm's tip; None: as for `world`.
+        flange: (4, 4) pose of the controller's flange in the arm's tip; None: known from the robot's description, or
+            from the controller's rule.
         files: file name to text, of further files of the controller.
     """
 
@@ -107,12 +108,12 @@ def placed(fitted: Fitted, program: Program, frame: str, statements: Statements)
                 tools[name] = _as_option(flange.pose @ pose)
                 notes.append(f"tool {name or 'active'}: {_in_words(pose)} in {flange}")
     elif len(tools) > 1:
-        refusals.append(f"--tool states one tool, the program has {listing(sorted(tools), 5)}: --frames FILE")
+        refusals.append(f"--tool states one tool, the program has {listing(sorted(tools), 5)}: give --frames FILE")
 
     user_names = {setting.user for setting in frames.settings}
     users = dict.fromkeys(user_names, np.eye(4))
     if in_station and statements.user is not None:
-        refusals.append(f"--user-frame and --frame {frame} both say where the user frame is: state one of them")
+        refusals.append(f"--user-frame and --frame {frame} both state the user frame: give one of them")
     if in_station:
         notes.append(f"user frame {listing(sorted(users), 5)}: that of station '{frame}', as calib deliver gives it")
     else:
@@ -125,7 +126,7 @@ def placed(fitted: Fitted, program: Program, frame: str, statements: Statements)
                 notes.append(f"user frame {name or 'active'}: {_in_words(pose)} in {base}")
     if refusals:
         count = len(frames.settings)
-        head = f"{program.path}: its {count} poses stand in frames that are not known; nothing was written"
+        head = f"{program.path}: the frames of its {count} poses are missing or contradictory; nothing was written"
         raise UsageError("\n  ".join([head, *refusals]))
     if not in_station:
         warnings = [base.warning, flange.warning]
@@ -137,6 +138,11 @@ def tool_in_tip(fitted: Fitted, controller: Controller, statements: Statements) 
     """Return the specified tool in the form that `joint_commands.placements` accepts; ``flange`` if none is specified.
 
     Used for joint targets, since a program does not name a tool for them.
+
+    Args:
+        fitted: the calibrated arm with its tools.
+        controller: the program's controller, which defines the flange.
+        statements: what the user specifies about the frames.
 
     Raises:
         UsageError: a tool that cannot be parsed, or a controller whose flange is not known.
@@ -160,7 +166,14 @@ def _as_option(pose: np.ndarray) -> str:
 def _grouped(
     program: Program, program_frames: ProgramFrames, tools: Mapping[str, str], users: Mapping[str, np.ndarray]
 ) -> tuple[Group, ...]:
-    """Return the program's poses grouped by tool and configuration, the groups in order of first appearance."""
+    """Return the program's poses grouped by tool and configuration, the groups in order of first appearance.
+
+    Args:
+        program: a program with poses.
+        program_frames: tool, user frame and configuration of each pose.
+        tools: name of a tool in the program to the tool in the form that `joint_commands.placements` accepts.
+        users: name of a user frame in the program to its pose (4, 4) in the frame of the targets.
+    """
     settings = program_frames.settings
     members: dict[tuple[str, str], list[int]] = {}
     for k, setting in enumerate(settings):
@@ -177,7 +190,15 @@ def _grouped(
 
 
 def _stated_tool(statement: str | None, names: Sequence[str]) -> np.ndarray | None:
-    """Return the specified tool's pose (4, 4) in the controller's flange; None where no tool is specified."""
+    """Return the specified tool's pose (4, 4) in the controller's flange; None where no tool is specified.
+
+    Args:
+        statement: ``flange`` or ``x,y,z[,roll,pitch,yaw]`` [m, rad]; None: not specified.
+        names: names of the fit's tools, for the error message.
+
+    Raises:
+        UsageError: any other text.
+    """
     if statement == "flange":
         return np.eye(4)
     try:
@@ -221,24 +242,30 @@ def _completed(
     if statement is not None and len(missing) == 1:
         return result | {missing[0]: statement}
     if statement is not None and missing:
-        refusals.append(f"{option} states one {label}, {len(missing)} have no numbers: --frames FILE instead")
+        refusals.append(f"{option} states one {label}, but {len(missing)} have no values: give --frames FILE instead")
     elif statement is not None:
         # no frame lacks numbers: the statement has to agree with those that were read
         for name, pose in result.items():
             if np.abs(pose - statement).max() > AGREE:
-                difference = f"{label} {name} is {_in_words(pose)} in the program's files"
-                refusals.append(f"{option} says {_in_words(statement)}, {difference}")
+                difference = f"but {label} {name} is {_in_words(pose)} in the program's files: correct one of them"
+                refusals.append(f"{option} states {_in_words(statement)}, {difference}")
     for name in missing:
         location = f"line {listing(lines[name], 3)}"
-        subject = f"the {label} that is active"
+        subject = f"the active {label}"
         if name:
             subject = f"{label} {name}"
-        refusals.append(f"{subject} ({location}) has no numbers here: {_advice(program, kind, option)}")
+        refusals.append(f"{subject} ({location}) has no values in these files: state {_advice(program, kind, option)}")
     return result
 
 
 def _advice(program: Program, kind: str, option: str) -> str:
-    """Return a text that explains how the user can specify the numbers of a tool or a user frame."""
+    """Return a text that explains how the user can specify the numbers of a tool or a user frame.
+
+    Args:
+        program: the program, whose controller names the reference frame.
+        kind: ``tool`` or ``user``.
+        option: name of the option by which the frame is specified.
+    """
     frame = program.controller.base
     if kind == "tool":
         frame = program.controller.flange

@@ -96,13 +96,17 @@ class CompensatedProgram:
                 notes += [line for line in lines(part.commands) if not line.startswith("not reached")]
         # a note that several parts have is said once
         result = list(dict.fromkeys(notes))
-        result += [f"not reached, left as it was: {reason}" for reason in self.lost]
+        result += [f"not reached, target unchanged: {reason}" for reason in self.lost]
         if self.program.unread:
             result.append(self.program.unread)
         return result
 
     def write(self, out: Path, partial: bool) -> Path:
         """Write the program with its new targets and return its path.
+
+        Args:
+            out: file of the new program.
+            partial: also write the program if some targets are not reached; their numbers are unchanged.
 
         Raises:
             UsageError: no target is reached, or, without `partial`, some are not; nothing is written.
@@ -113,7 +117,7 @@ class CompensatedProgram:
             head = f"{self.program.path}: {len(lost)} of {count} targets are not reached; nothing was written"
             message = "\n  ".join([head, *lost])
             if len(lost) != count:
-                message += "\nwith --partial, these stay as they are"
+                message += "\nwith --partial, all other targets are written, and those above stay unchanged"
             raise UsageError(message)
         return files.write(out, self.program.rewritten(self.values))
 
@@ -149,7 +153,9 @@ def compensated(
     n = fitted.nominal.chain.n
     if joints and len(program.targets[joints[0]].values) != n:
         axes = len(program.targets[joints[0]].values)
-        raise UsageError(f"{program.path}: its targets have {axes} axes, the robot has {n} joints")
+        raise UsageError(
+            f"{program.path}: its targets have {axes} axes, but the robot has {n} joints: is it for another robot?"
+        )
     groups, notes = (), ()
     if poses:
         placement = placed(fitted, program, frame, statements)
@@ -167,7 +173,14 @@ def compensated(
 
 
 def _check_postures(fitted: Fitted, program: Program, groups: Sequence[Group], start: Sequence[float] | None) -> None:
-    """Raise UsageError if poses have no configuration and no start is given."""
+    """Raise UsageError if poses have no configuration and no start is given.
+
+    Args:
+        fitted: the calibrated arm, whose nominal arm may have a spherical wrist (configurations require one).
+        program: the program.
+        groups: its poses by tool and configuration.
+        start: (n,) joint values that decide between configurations; None: not given.
+    """
     if start is not None:
         return
     spherical = has_spherical_wrist(fitted.nominal.chain)
@@ -177,18 +190,26 @@ def _check_postures(fitted: Fitted, program: Program, groups: Sequence[Group], s
             silent += group.indices
     if silent:
         location = f"{len(silent)} targets (the first in line {program.targets[min(silent)].line})"
-        cause = "the program does not say elbow or wrist"
+        cause = "the program does not state the configuration of elbow and wrist"
         if not spherical and any(group.configuration for group in groups):
-            cause = "configurations are read for arms whose last three axes meet, which this is not"
+            cause = "configurations are read only for arms whose last three axes meet in a point, unlike this arm"
         raise UsageError(
-            f"{program.path}: {location} are poses, and {cause}; give joints near them: --start q1,...,qn [rad]"
+            f"{program.path}: {location} are poses, and {cause}; give joint values near them: --start q1,...,qn [rad]"
         )
 
 
 def _compensated_group(
     fitted: Fitted, program: Program, group: Group, start: Sequence[float] | None, options: FieldValues
 ) -> Part:
-    """Return the joint commands and new numbers for the poses of one group."""
+    """Return the joint commands and new numbers for the poses of one group.
+
+    Args:
+        fitted: the calibrated arm.
+        program: the program.
+        group: the poses, with one tool and one configuration.
+        start: (n,) joint values near which the joint values of poses are sought [rad]; None: not given.
+        options: frame, seed and further arguments of `joint_commands.computed`.
+    """
     controller = program.controller
     model, _ = placements(fitted, options["frame"], group.tool)
     chain = model.chain
@@ -213,13 +234,18 @@ def _compensated_group(
 
 
 def _without(commands: Commands, reasons: Sequence[str]) -> Commands:
-    """Return the commands with those marked as not reached that have a non-empty reason in `reasons` (m,)."""
+    """Return the commands, those with a non-empty text in `reasons` marked as not reached for that reason.
+
+    Args:
+        commands: m joint commands.
+        reasons: (m,) texts.
+    """
     reached = commands.reached.copy()
     command_reasons = list(commands.reason)
     for k, reason in enumerate(reasons):
         if reason:
             reached[k] = False
-            command_reasons[k] = f"{reason}; --start takes the posture nearest to it"
+            command_reasons[k] = f"{reason}; with --start q1,...,qn the posture nearest to it is taken"
     return replace(commands, reached=reached, reason=tuple(command_reasons))
 
 
@@ -230,6 +256,13 @@ def _posture_notes(
 
     A configuration is contradictory if no posture at the pose has it, or if the posture nearest to the start has
     another.
+
+    Args:
+        program: the program.
+        group: the poses, with one tool and one configuration.
+        configuration: the configuration that the program prescribes.
+        commands: the joint commands at these poses.
+        sought: the nominal arm's postures at these poses.
     """
     notes = []
     reached = commands.reached
@@ -240,13 +273,11 @@ def _posture_notes(
         notes.append(f"warning: line {lines[k]}: {sought.reasons[k]}; {outcome}")
     against = lines[reached & sought.contradicted & ~unfit]
     if len(against):
-        message = f"the posture nearest to --start is not that of {configuration.text}, which is followed"
+        message = f"the posture nearest to --start is not that of {configuration.text}; the latter is taken"
         notes.append(f"line {listing(against.tolist(), 5)}: {message}")
     chain = commands.fitted.nominal.chain
     crossing = lines[reached & ~unfit & ~configuration.holds(program.controller, chain, commands.q)]
     if len(crossing):
-        message = (
-            f"the command crosses the boundary of {configuration.text}, which stays in the program: change it there"
-        )
+        message = f"the new joint values are outside {configuration.text}, which stays in the program: change it there"
         notes.append(f"warning: line {listing(crossing.tolist(), 5)}: {message}")
     return tuple(notes)

@@ -4,7 +4,7 @@ OFFERS = {"commands": "commands:app", "formats": ":FORMATS", "write_program": "p
 FORMATS = {
     "programs": (
         "programs for robot controllers, of calib program",
-        "calib.apps.controller_programs.program calib.apps.controller_programs.motion "
+        "calib.apps.controller_programs.program calib.apps.controller_programs.motion_streams "
         "calib.apps.controller_programs.targets calib.controllers.table",
         "",
     ),

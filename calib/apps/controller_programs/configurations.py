@@ -57,12 +57,12 @@ SIGN_LABELS = (
 
 @dataclass(frozen=True)
 class Configuration:
-    """The posture (of several inverse-kinematics solutions) that a program prescribes at a pose.
+    """The posture (one of several inverse-kinematics solutions) that a program prescribes at a pose.
 
     Attributes:
         text: the configuration as the program writes it.
-        before, elbow, wrist: signs +1 or -1 for the wrist centre (+1: in front of axis 1), the elbow and axis 5, as the
-            module's docstring defines them; 0 where the program does not prescribe one.
+        before, elbow, wrist: signs +1 or -1 for the wrist centre (+1: in front of axis 1), the elbow (+1: as in the
+            posture `upright`) and axis 5 (the sign of its angle); 0 where the program does not prescribe one.
         ranges: joint index (from 0) to least and largest angle that the controller shows [rad].
         upright: (6,) posture [rad] in which `before` and `elbow` are +1.
     """
@@ -82,6 +82,10 @@ class Configuration:
         """Return whether each posture q (m, n) [rad] has the prescribed signs, (m,) bool.
 
         Whole turns are not checked.
+
+        Args:
+            chain: the arm.
+            q: postures.
         """
         posture_signs = signs_at(chain, q, np.array(self.upright))
         required = np.array(self.signs())
@@ -93,6 +97,12 @@ class Configuration:
 
         Of several possible turns, the one nearest to `reference` (n,) is taken. Where no turn brings a joint into its
         range, the joint's value is NaN.
+
+        Args:
+            controller: the controller to whose angles the prescribed ranges refer.
+            goal: the arm with its joint limits.
+            q: postures.
+            reference: joint values [rad].
         """
         lower = np.broadcast_to(goal.lower, q.shape)
         upper = np.broadcast_to(goal.upper, q.shape)
@@ -113,7 +123,13 @@ class Configuration:
         return best
 
     def holds(self, controller: Controller, chain: Chain, q: np.ndarray) -> np.ndarray:
-        """Return whether each posture q (m, n) [rad] has the prescribed signs and turns, (m,) bool."""
+        """Return whether each posture q (m, n) [rad] has the prescribed signs and turns, (m,) bool.
+
+        Args:
+            controller: the controller to whose angles the prescribed turns refer.
+            chain: the arm.
+            q: postures.
+        """
         allowed = self.agrees(chain, q)
         for joint, (smallest, largest) in self.ranges.items():
             angle = q[:, joint]
@@ -122,7 +138,7 @@ class Configuration:
 
 
 def has_spherical_wrist(chain: Chain) -> bool:
-    """Return whether an arm has six revolute joints of which the last three axes intersect in a point.
+    """Return whether the arm `chain` has six revolute joints of which the last three axes intersect in a point.
 
     Configurations are defined for such arms only.
     """
@@ -142,7 +158,7 @@ def configuration_of(controller: Controller, text: str) -> Configuration | None:
 
     Args:
         controller: the robot's controller, whose language determines how the text is read.
-        text: `calib.apps.controller_programs.languages.Setting.configuration`.
+        text: the configuration in the program, such as ``N U T, 0, 0, 0``.
     """
     readers = {"tp": _tp, "krl": _krl, "rapid": _rapid}
     reader = readers.get(controller.language)
@@ -231,6 +247,10 @@ def _distances(chain: Chain, q: np.ndarray) -> np.ndarray:
 
     The first is the distance from axis 1 towards the front [m]. The second is the distance from the line between axes 2
     and 3, multiplied by that line's length [m²]. Which side is positive differs from arm to arm.
+
+    Args:
+        chain: an arm with a spherical wrist.
+        q: (m, 6) postures [rad].
     """
     points, axes = _axes(chain, q)
     wrist = _nearest_point(points[4], axes[4], points[3], axes[3])
@@ -242,7 +262,12 @@ def _distances(chain: Chain, q: np.ndarray) -> np.ndarray:
 
 
 def _axes(chain: Chain, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a point on each joint's axis and the axis' direction, both (n, m, 3), at postures (m, n)."""
+    """Return a point on each joint's axis [m] and the axis' direction, both (n, m, 3), in the arm's base.
+
+    Args:
+        chain: the arm.
+        q: (m, n) postures [rad].
+    """
     frames = joint_frames(chain, q)
     directions = []
     for joint, element_index in enumerate(chain.moving):
@@ -358,7 +383,15 @@ def postures(
 def _agreeing(
     goal: Goal, configuration: Configuration, controller: Controller, reached: np.ndarray, reference: np.ndarray
 ) -> np.ndarray:
-    """Return the distinct postures among `reached` (k, n) that have the configuration, with its whole turns added."""
+    """Return the distinct postures that have the configuration, with its whole turns added.
+
+    Args:
+        goal: the nominal arm with the tool, and its limits.
+        configuration: the prescribed configuration.
+        controller: the controller to whose angles the configuration refers.
+        reached: (k, n) postures that reach the pose [rad].
+        reference: (n,) joint values to which the nearest turns are taken [rad].
+    """
     in_configuration = reached[configuration.agrees(goal.cell.chain, reached)]
     wrapped = configuration.wrapped(controller, goal, in_configuration, reference)
     wrapped = wrapped[np.isfinite(wrapped).all(axis=1)]
@@ -382,14 +415,14 @@ def _objection(
         started: whether a start is given, which decides between several postures.
     """
     if not len(agreeing) and configuration.agrees(chain, reached).any():
-        return f"{configuration.text} has no posture at this pose: none within the joints' limits has its turns"
+        return f"{configuration.text} has no posture at this pose: none within the joints' limits has the stated turns"
     if not len(agreeing):
         signs = signs_at(chain, reached, np.array(configuration.upright))
         alternatives = "; ".join(_sign_text(row) for row in np.unique(signs, axis=0))
         required = _sign_text(np.array(configuration.signs())) or "turns only"
         return f"{configuration.text} ({required}) is no posture at this pose; the arm reaches it with {alternatives}"
     if len(agreeing) > 1 and not started:
-        return f"{configuration.text} leaves {len(agreeing)} postures"
+        return f"{configuration.text} is ambiguous: {len(agreeing)} postures agree with it"
     return ""
 
 
@@ -405,7 +438,13 @@ def _sign_text(signs: np.ndarray) -> str:
 
 
 def _met(goal: Goal, q: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """Return whether each posture q (m, n) reaches the corresponding pose (m, 4, 4), (m,) bool."""
+    """Return whether each posture q (m, n) reaches the corresponding pose (m, 4, 4), (m,) bool.
+
+    Args:
+        goal: the arm with the tool, and the constrained pose components.
+        q: postures.
+        poses: target poses.
+    """
     difference = differences(goal, q, poses)
     position_error = np.linalg.norm(difference[:, :3], axis=1)
     turn_error = np.linalg.norm(difference[:, 3:], axis=1)

@@ -49,7 +49,7 @@ def delivery_text(
     frames = base_frame(controller, arm, world), flange_frame(controller, arm, flange)
     verdicts = open_result(fit, "deliver").verdicts
     lines = [f"{controller.title}: calibration of {robot.chain.name}", str(verdicts), ""]
-    lines += [f"It takes: {controller.takes}.", f"It does not: {controller.closed}.", ""]
+    lines += [f"The controller accepts: {controller.takes}.", f"It does not accept: {controller.closed}.", ""]
     if len(nominal.tools):
         lines += [
             "Frames if the controller's geometry and mastering stay as they are:",
@@ -57,7 +57,7 @@ def delivery_text(
             "",
         ]
     if not controller.mastered:
-        lines.append("Its axes are not mastered by their users.")
+        lines.append("Users cannot master the axes of this controller.")
     elif fit_folder is not None and fit_folder.metrics().model == "offsets":
         lines += [
             "Mastering, with frames that belong to it:",
@@ -76,7 +76,13 @@ def delivery_text(
 
 
 def _frames(arm: Installation, controller: Controller, base: ControllerFrame, flange: ControllerFrame) -> Iterator[str]:
-    """Yield lines with an arm's tool frames and instrument frames in the controller's notation."""
+    """Yield lines with an arm's tool frames and instrument frames in the controller's notation.
+
+    Args:
+        arm: the arm with its stations and tools.
+        controller: the controller.
+        base, flange: the controller's base and flange, located in the arm's base and tip.
+    """
     for index, (name, pose) in enumerate(zip(arm.tool_names, arm.tools), 1):
         yield from _stood(f"tool {name}", controller.tool_frame, controller, pose, flange, index)
     for index, (name, pose) in enumerate(zip(arm.station_names, invert(arm.stations)), 1):
@@ -90,7 +96,7 @@ def _stood(
 
     Args:
         name: kind and name of the frame.
-        form: template of the controller for such a frame.
+        form: the controller's template for the text of such a frame.
         controller: the controller.
         pose: (4, 4) pose in the arm's base or tip.
         frame: the controller's base or flange.
@@ -110,7 +116,12 @@ def _written(form: str, controller: Controller, pose: np.ndarray, index: int) ->
 
 
 def _mastering(robot: CalibratedChain, controller: Controller) -> Iterator[str]:
-    """Yield one line per axis with the offset to add to the displayed angle, in the controller's unit."""
+    """Yield one line per axis with the offset to add to the displayed angle, in the controller's unit.
+
+    Args:
+        robot: the calibrated arm with its nominal description.
+        controller: the controller.
+    """
     chain, nominal = robot.chain, nominal_of(robot)
     offsets = []
     for k in chain.moving:

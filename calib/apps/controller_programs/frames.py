@@ -56,14 +56,24 @@ class ControllerFrame:
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """The nominal arm `chain`, and the links of its URDF, `tree`; None without a URDF."""
+    """The nominal arm, with the links of its URDF.
+
+    Attributes:
+        chain: the nominal arm.
+        tree: links and joints of its URDF; None without a URDF.
+    """
 
     chain: Chain
     tree: UrdfTree | None = None
 
     @classmethod
     def of_fit(cls, folder: Path, chain: Chain) -> Self:
-        """Return the description of a fit's nominal arm, with the links of the fitted URDF if the fit has one."""
+        """Return the description of a fit's nominal arm, with the links of the fitted URDF if the fit has one.
+
+        Args:
+            folder: the fit's folder.
+            chain: the nominal arm.
+        """
         path = FitFolder(folder).urdf
         if not path.is_file():
             return cls(chain)
@@ -116,7 +126,12 @@ class Description:
 
 
 def _fixed_to(tree: UrdfTree, link: str) -> tuple[str, np.ndarray]:
-    """Return the uppermost link to which a link is rigidly fixed, and the pose (4, 4) of `link` in that link."""
+    """Return the uppermost link to which a link is rigidly fixed, and the pose (4, 4) of `link` in that link.
+
+    Args:
+        tree: links and joints of the URDF.
+        link: name of the link.
+    """
     pose = np.eye(4)
     while link in tree.above and tree.above[link].kind == "fixed":
         pose = tree.above[link].origin @ pose
@@ -125,7 +140,11 @@ def _fixed_to(tree: UrdfTree, link: str) -> tuple[str, np.ndarray]:
 
 
 def stated_frame(statement: str | None, option: str) -> np.ndarray | None:
-    """Return the pose (4, 4) from the text of an option, ``x,y,z[,roll,pitch,yaw]`` [m, rad]; None for None.
+    """Return the pose (4, 4) [m] that the user stated by an option; None where the option was not used.
+
+    Args:
+        statement: text ``x,y,z[,roll,pitch,yaw]`` [m, rad]; None: the option was not used.
+        option: name of the option, for the message.
 
     Raises:
         UsageError: not three or six finite numbers, or a position so large that it must be in millimetres.
@@ -174,7 +193,7 @@ def base_frame(controller: Controller, arm: Description, statement: np.ndarray |
         joint = arm.moving_joint(link)
         return ControllerFrame(name, None, f"not known: link '{link}' moves with joint '{joint}'; {state}")
     if not footed and ruled is not None and _differs(pose, ruled):
-        basis = f"not known: link '{link}' is the description's root, and {name} stands {rule}; {state}"
+        basis = f"not known: link '{link}' is the description's root, and {name} is usually {rule}; {state}"
         return ControllerFrame(name, None, basis)
     relation = _relation(pose, chain.base)
     if footed:
@@ -183,7 +202,7 @@ def base_frame(controller: Controller, arm: Description, statement: np.ndarray |
             relation = _relation(pose_on_foot, foot)
     warning = ""
     if ruled is not None and _differs(pose, ruled):
-        warning = f"link '{link}' does not stand where {name} usually does ({rule}): compare with the pendant"
+        warning = f"link '{link}' is not where {name} usually is ({rule}): compare with the pendant"
     return ControllerFrame(name, pose, f"link {link}, {relation}", warning)
 
 
@@ -225,7 +244,7 @@ def _by_rule(controller: Controller, arm: Description) -> tuple[np.ndarray | Non
     """
     foot = arm.prefix + "base_link"
     if not controller.base_at:
-        return None, f"nothing is known of {controller.title}"
+        return None, f"the base frame of {controller.title} is not documented"
     start = arm.chain.base
     if arm.has(foot):
         start = foot
@@ -235,11 +254,11 @@ def _by_rule(controller: Controller, arm: Description) -> tuple[np.ndarray | Non
     if controller.base_at == "axis 2":
         height = _height_of_axis_2(arm.chain, placed)
         if height is None:
-            return None, f"{controller.base}'s height, that of axis 2, is none in this arm"
+            return None, f"{controller.base} is at the height of axis 2, which this arm does not determine"
         rule = f"by rule at the height of axis 2, {height:.6g} m above {start}"
         return placed @ from_xyz_rpy([0.0, 0.0, height], NO_TURN), rule
     if not arm.has(foot):
-        return None, f"there is no link '{foot}' against which {controller.base} stands"
+        return None, f"no link '{foot}', relative to which {controller.base} is defined"
     if controller.base_at == "turned":
         turned = placed @ from_xyz_rpy(NO_SHIFT, [0.0, 0.0, np.pi])
         return turned, f"by rule {foot}, turned by 180° about z"
@@ -250,6 +269,10 @@ def _height_of_axis_2(chain: Chain, foot: np.ndarray) -> float | None:
     """Return the height of axis 2 above the frame with pose `foot` (4, 4) in the arm's base [m].
 
     None where axis 1 is not the frame's z axis, or axis 2 is not horizontal.
+
+    Args:
+        chain: the arm.
+        foot: pose of the frame.
     """
     if chain.n < 2:
         return None
@@ -270,7 +293,12 @@ def _height_of_axis_2(chain: Chain, foot: np.ndarray) -> float | None:
 
 
 def _line(chain: Chain, joint: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return a point (3,) [m] on a joint's axis and the direction (3,) of the axis at q = 0, in the arm's base."""
+    """Return a point (3,) [m] on a joint's axis and the axis' direction (3,) at q = 0, in the arm's base.
+
+    Args:
+        chain: the arm.
+        joint: index of the joint, from 0.
+    """
     frame = joint_frames(chain, np.zeros((1, chain.n)))[joint, 0]
     element = chain.elements[int(chain.moving[joint])]
     column = AXES.index(element.axis) % 3

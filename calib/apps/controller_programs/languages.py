@@ -70,7 +70,9 @@ def frames_in(program: Program, further: Mapping[str, str] | None = None) -> Pro
     """
     language = LANGUAGES.get(program.controller.language)
     if language is None:
-        raise UsageError(f"{program.path}: tool and user frames of {program.controller.title} are not read")
+        raise UsageError(
+            f"{program.path}: frames in programs of {program.controller.title} are not read; give the targets as a CSV"
+        )
     blank = language.without_comments(program.text)
     settings = tuple(language.setting(blank, program.targets[k]) for k in program.of("pose"))
     tools: dict[str, np.ndarray] = {}
@@ -81,7 +83,7 @@ def frames_in(program: Program, further: Mapping[str, str] | None = None) -> Pro
         for kind, frames in zip((tools, users), numbers):
             for name, pose in frames.items():
                 if name in kind and np.abs(kind[name] - pose).max() > 1e-9:
-                    raise UsageError(f"{file}: {name} is given twice, with other numbers")
+                    raise UsageError(f"{file}: {name} is given twice with different values; remove one")
                 kind[name] = pose
     tools |= dict.fromkeys(language.flange, np.eye(4))
     users |= language.base()
@@ -125,21 +127,32 @@ class Language:
 def _frame(form: str) -> str:
     """Return the regular expression for a short pattern of a frame.
 
-    In the pattern, NUM is a number, and a blank is any number of blanks.
+    Args:
+        form: the pattern, in which NUM is a number and a blank is any number of blanks.
     """
     return form.replace(" ", r"\s*").replace("NUM", NUMBER)
 
 
 def _posed(match: re.Match[str], first: int, controller: Controller, count: int = 6) -> np.ndarray:
-    """Return the pose (4, 4) [m] from `count` numbers in a regular expression's match, from group `first` on."""
+    """Return the pose (4, 4) [m] that consecutive groups of a regular expression's match contain.
+
+    Args:
+        match: the match.
+        first: index of the first group with a number.
+        controller: the controller, which determines units and angles.
+        count: number of numbers.
+    """
     values = [float(match[group]) for group in range(first, first + count)]
     return pose_of_values(controller, np.array([values]))[0]
 
 
 def _either(pairs: set[tuple[str, str]]) -> tuple[str, str]:
-    """Return tool and user frame of the moves (tool, user frame) that use one target.
+    """Return tool and user frame of the moves that use one target.
 
     Where moves differ, their names are joined by 'or'; no frame has such a name.
+
+    Args:
+        pairs: (tool, user frame) of each move.
     """
     tools = {tool for tool, _ in pairs}
     users = {user for _, user in pairs}
@@ -171,6 +184,11 @@ def _tp_name(text: str, kind: str, number: str) -> str:
 
     For the number ``F`` (the active frame), it is the only frame that the program selects; empty if it selects none or
     several.
+
+    Args:
+        text: the program without comments.
+        kind: beginning of the name, ``UTOOL`` or ``UFRAME``.
+        number: number of the frame, or ``F``.
     """
     if not number.isdigit():
         selected = set(re.findall(rf"{kind}_NUM\s*=\s*(\d+)", text))
@@ -216,7 +234,8 @@ def _krl_setting(text: str, target: Target) -> Setting:
     if data is not None:
         if re.search(r"(?i)IPO_FRAME\s+#TCP", data[0]):
             raise UsageError(
-                f"line {target.line}: {point[1]} moves about a tool in the cell (IPO_FRAME #TCP): not read"
+                f"line {target.line}: {point[1]} is relative to a tool fixed in the cell (IPO_FRAME #TCP), which is "
+                "not supported: use a tool on the flange"
             )
         return Setting(_krl_name("TOOL", data[1]), _krl_name("BASE", data[2]), configuration)
     moves = re.finditer(rf"(?im)^\s*S?(?:PTP|LIN|CIRC)\b[^\n]*\b{re.escape(point[1])}\b", text)
@@ -301,7 +320,11 @@ def _rapid_setting(text: str, target: Target) -> Setting:
 
 
 def _rapid_frames(statement: str) -> tuple[str, str]:
-    """Return the names of tool (the last argument) and work object in the arguments of a RAPID move."""
+    """Return the names of the tool and the work object that a RAPID move uses.
+
+    Args:
+        statement: arguments of the move; the last one is the tool.
+    """
     work = _RAPID_WOBJ.search(statement)
     plain = re.sub(r"\\\w+(?:\s*:=\s*\w+)?", "", statement)
     tool = re.search(r",\s*([A-Za-z_]\w*)\s*$", plain)
@@ -314,14 +337,22 @@ def _rapid_numbers(text: str, controller: Controller) -> tuple[Frames, Frames]:
     tools: Frames = {}
     for match in _RAPID_TOOL.finditer(text):
         if match[2].upper() == "FALSE":
-            raise UsageError(f"tooldata {match[1]}: a tool that the robot does not hold (robhold FALSE) is not read")
+            raise UsageError(
+                f"tooldata {match[1]}: a tool fixed in the cell (robhold FALSE) is not supported: use one on the flange"
+            )
         tools[match[1].lower()] = _posed(match, 3, controller, 7)
     users: Frames = {}
     for match in _RAPID_WORK.finditer(text):
         if match[2].upper() == "TRUE":
-            raise UsageError(f"wobjdata {match[1]}: a work object that the robot holds (robhold TRUE) is not read")
+            raise UsageError(
+                f"wobjdata {match[1]}: a work object on the robot (robhold TRUE) is not supported: use one fixed in "
+                "the cell"
+            )
         if match[3].upper() == "FALSE" or match[4]:
-            raise UsageError(f"wobjdata {match[1]}: a work object on a moving mechanical unit is not read")
+            raise UsageError(
+                f"wobjdata {match[1]}: a work object on a moving mechanical unit is not supported: use one fixed in "
+                "the cell"
+            )
         user_frame = _posed(match, 5, controller, 7)
         object_frame = _posed(match, 12, controller, 7)
         users[match[1].lower()] = user_frame @ object_frame

@@ -19,7 +19,7 @@ import jinja2
 import numpy as np
 
 from calib import files
-from calib.apps.controller_programs.motion import is_motion, setpoints, stream_values
+from calib.apps.controller_programs.motion_streams import is_motion, setpoints, stream_values
 from calib.apps.controller_programs.program_settings import CSV, ProgramSettings
 from calib.apps.controller_programs.targets import formatted, is_program, read_program
 from calib.errors import UsageError
@@ -44,7 +44,7 @@ def joints_in(path: Path, source: str = "") -> tuple[np.ndarray, list[str]]:
     if source or is_program(path):
         program = read_program(path, source)
         if not program.of("joints"):
-            raise UsageError(f"{path}: its targets are poses of the tool, not joints")
+            raise UsageError(f"{path}: its targets are poses of the tool; give a list or program of joint values")
         q = program.joints()
         return q, [f"q{number}" for number in range(1, q.shape[1] + 1)]
 
@@ -58,18 +58,23 @@ def joints_in(path: Path, source: str = "") -> tuple[np.ndarray, list[str]]:
         elif unit.lower() in ANGLES:
             names.append(name)
     if sliding:
-        raise UsageError(f"{path}: programs have turning joints only; {', '.join(sliding)} slides")
+        raise UsageError(f"{path}: programs are for revolute joints only, not lengths: {', '.join(sliding)}")
     if not names:
         columns = ", ".join(table.header)
-        raise UsageError(f"{path}: no column of joint angles, as 'joint1 [deg]'; found {columns}")
+        raise UsageError(f"{path}: no column of joint angles with its unit, as 'joint1 [deg]'; found {columns}")
     return read_poses(path, names), names
 
 
 def joints_table(path: Path, source: str = "") -> Table:
-    """Return the joint values of `joints_in` as a table [deg], with a column ``pose`` where all targets are numbered.
+    """Return the joint values in a file as a table [deg], with a column ``pose`` where all targets are numbered.
 
-    The file may also be one to which a controller wrote joint values: a UR's log, a KUKA's ``.dat``, a FANUC's
-    ``POSREG.VA``.
+    Args:
+        path: CSV of poses, program, or file to which a controller wrote joint values: a UR's log, a KUKA's ``.dat``, a
+            FANUC's ``POSREG.VA``.
+        source: the controller of a program, where its suffix does not determine it; empty otherwise.
+
+    Raises:
+        UsageError: as for `joints_in`.
     """
     q, names = joints_in(path, source)
     header = list(names)
@@ -119,7 +124,7 @@ def program_files(
         q, names = joints_in(path, source)
     check_controller(name, q.shape[1], settings.pulses)
     if settings.output is not None and not controller.outputs:
-        raise UsageError(f"--output: {controller.title} raises no output; the operator presses a key")
+        raise UsageError(f"--output: in programs for {controller.title} the operator presses a key; leave it out")
     values: dict[str, object]
     if moving:
         templates = controller.stream
@@ -184,7 +189,13 @@ def write_program(path: Path, out: Path, name: str) -> list[Path]:
 
 
 def _poses(controller: Controller, q: np.ndarray, settings: ProgramSettings) -> list[list[str]]:
-    """Return joint values q (m, n) [rad] as texts in a controller's units and number of decimals."""
+    """Return joint values (m, n) [rad] as texts in a controller's units and number of decimals.
+
+    Args:
+        controller: the controller.
+        q: joint values.
+        settings: settings of the program, of which the pulses per degree are used.
+    """
     values = controller.shown(q)
     if controller.pulses:
         values = values * np.array(settings.pulses)

@@ -121,7 +121,7 @@ class Program:
 
 
 def number(value: float, decimals: int) -> str:
-    """Return a number as text with `decimals` decimals, and without a minus sign before zero."""
+    """Return `value` as text with `decimals` decimals, and without a minus sign before zero."""
     written = f"{value:.{decimals}f}"
     if float(written) == 0.0:
         return written.removeprefix("-")
@@ -148,7 +148,12 @@ def pose_values(controller: Controller, poses: np.ndarray) -> np.ndarray:
 
 
 def pose_of_values(controller: Controller, values: np.ndarray) -> np.ndarray:
-    """Return the poses (m, 4, 4) [m] for the numbers (m, 6 or 7) in a controller's programs."""
+    """Return the poses (m, 4, 4) [m] that a controller's programs contain as rows of numbers.
+
+    Args:
+        controller: the controller.
+        values: (m, 6 or 7) numbers [the controller's units]: position, then angles or quaternion.
+    """
     rotation = _rotation(controller.turn, values[:, 3:])
     position = values[:, :3] * controller.metres
     return pose_of(rotation, position)
@@ -176,7 +181,7 @@ def _order(turn: str) -> tuple[str, bool]:
 
 
 def is_program(path: Path) -> bool:
-    """Return whether a file has the suffix of a controller's program."""
+    """Return whether the name of the file `path` has the suffix of a controller's program."""
     try:
         return bool(controller_of(path))
     except UsageError:
@@ -184,7 +189,7 @@ def is_program(path: Path) -> bool:
 
 
 def text_of(path: Path) -> str:
-    """Return the text of a controller's file, decoded so that each byte is one character.
+    """Return the text of the controller's file at `path`, decoded so that each byte is one character.
 
     Raises:
         MeasurementError: the file cannot be read.
@@ -211,7 +216,7 @@ def read_program(path: Path, controller: str = "") -> Program:
     if not targets:
         moves = listing(_lines_of_moves(text, kind), 3)
         moves_message = f"its moves are in line {moves}" if moves else "nor any moves"
-        message = f"has no targets with all their numbers, as {kind.title} writes them; {moves_message}"
+        message = f"has no complete targets in the form that {kind.title} writes; {moves_message}"
         raise MeasurementError(message, path)
     targets.sort(key=lambda target: target.spans[0])
     return Program(path, kind, text, tuple(targets))
@@ -239,7 +244,7 @@ def _matches(text: str, pattern: str, comment: str) -> list[re.Match[str]]:
 
 
 def _lines_of_moves(text: str, controller: Controller) -> list[int]:
-    """Return the line numbers, from 1, of the motion statements."""
+    """Return the line numbers, from 1, of the motion statements in the text of a controller's program."""
     matches = _matches(text, controller.moves, controller.comment)
     return [_line_at(text, match.end()) for match in matches]
 
@@ -262,7 +267,13 @@ def _targets_of_kind(text: str, kind: str, controller: Controller) -> list[Targe
 
 
 def _pose_number(text: str, match: re.Match[str], controller: Controller) -> int:
-    """Return the pose number in the text before a target; 0 where there is none."""
+    """Return the pose number in the text shortly before a target; 0 where there is none.
+
+    Args:
+        text: the program.
+        match: match of the target.
+        controller: the controller, which defines how poses are numbered.
+    """
     if not controller.numbered:
         return 0
     before = text[max(match.start() - NEAR, 0) : match.start(1)]

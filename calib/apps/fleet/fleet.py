@@ -82,7 +82,9 @@ def run_sessions(
     plots: bool = True,
     command: str = "calib.run_sessions",
 ) -> Iterator[FleetRow]:
-    """Run sessions as far as possible, and yield the outcome of each; a failed session does not stop the others.
+    """Run each session until it is complete or waits for files, and yield the outcome of each.
+
+    A failed session does not stop the others.
 
     Args:
         folders: one or several folders of sessions, or their ``session.toml``. Or addresses of fsspec, with or without
@@ -133,9 +135,9 @@ def run(
 
 
 def run_session(folder: Path | str, command: str = "calib run", plots: bool = True, lease: float = LEASE) -> FleetRow:
-    """Run one session as far as possible, write its output to ``run.log`` and return the outcome.
+    """Run one session until it is complete or waits for files, and return the outcome.
 
-    Errors become part of the outcome; only KeyboardInterrupt (Ctrl-C) is raised.
+    Its output is written to ``run.log``. Errors become part of the outcome; only KeyboardInterrupt (Ctrl-C) is raised.
 
     Args:
         folder: the session's folder, or its address.
@@ -217,6 +219,9 @@ def table(outcomes: Sequence[FleetRow]) -> RenderableType:
     """Return the summary table, one line per robot, with errors at held-out poses and torque on held-out motions.
 
     The columns are state, verdict, rms position errors [mm], unexplained share of the torque [%] and time [s].
+
+    Args:
+        outcomes: outcome of each session.
     """
     summary_table = Table("session", "state", "verdict", box=None, pad_edge=False)
     for name in ("nominal mm", "calibrated mm", "torque %", "s"):
@@ -243,7 +248,11 @@ def table(outcomes: Sequence[FleetRow]) -> RenderableType:
 
 
 def remarks(outcomes: Sequence[FleetRow]) -> Iterator[str]:
-    """Yield a line for each unfinished session: the file for which the session waits, or the error message."""
+    """Yield a line for each unfinished session: the file for which the session waits, or the error message.
+
+    Args:
+        outcomes: outcome of each session.
+    """
     beginnings = {WAITS: "{} waits for ", FAILED: "{} failed: "}
     for row in outcomes:
         if row.state == DONE:
@@ -253,7 +262,12 @@ def remarks(outcomes: Sequence[FleetRow]) -> Iterator[str]:
 
 
 def summary(outcomes: Sequence[FleetRow], seconds: float) -> str:
-    """Return one line with the number of sessions in each state, the number with each verdict, and the total time."""
+    """Return one line with the number of sessions in each state, the number with each verdict, and the total time.
+
+    Args:
+        outcomes: outcome of each session.
+        seconds: the total time [s].
+    """
     states = Counter(row.state for row in outcomes)
     verdicts = Counter(row.verdict for row in outcomes)
     finished = f"{states[DONE]} of {len(outcomes)} done"

@@ -45,9 +45,13 @@ def sessions(address: str) -> list[str]:
     if not is_address(address):
         return []
     files, root = _opened(address)
-    with refused_as(UsageError, Exception, f"{address} cannot be read: {{}}"):
+    with refused_as(UsageError, Exception, f"{address} cannot be read: {{}}; check address and access"):
         session_paths = sorted(files.glob(f"{root}/{SESSION}"))
-    require(session_paths, f"{address}: no session is there ({SESSION})", UsageError)
+    require(
+        session_paths,
+        f"{address}: no session ({SESSION}) is there; give the folder that contains the sessions",
+        UsageError,
+    )
     return [files.unstrip_protocol(path.rpartition("/")[0]) for path in session_paths]
 
 
@@ -94,7 +98,14 @@ def _opened(address: str) -> tuple[Any, str]:
 
 
 class _Claim:
-    """The file at an address that names the process working on the folder; the constructor takes the claim."""
+    """The file at an address that names the process working on the folder; the constructor takes the claim.
+
+    Args:
+        files: file system of fsspec.
+        address: address of the folder, for messages.
+        path: path of the file in the file system.
+        lease: time [s] after which a claim that was not renewed is taken over.
+    """
 
     def __init__(self, files: Any, address: str, path: str, lease: float) -> None:
         self.files, self.address, self.path, self.beats = files, address, path, 0

@@ -51,7 +51,7 @@ class Throughput:
 
 
 def _signed(function: Callable[..., object], task: object) -> tuple[object, str, float]:
-    """Run a task; return its result, the worker (host and process), and the wall-clock time [s]."""
+    """Run function(task); return its result, the worker (host and process), and the wall-clock time [s]."""
     started = time.monotonic()
     result = function(task)
     return result, f"{socket.gethostname()}:{os.getpid()}", time.monotonic() - started

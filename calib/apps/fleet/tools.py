@@ -26,6 +26,8 @@ MIN_TIMES = 1.5
 class ToolUse:
     """Comparison of arms with one tool against arms of the same type with other tools.
 
+    `moved`, `moved_sigmas`, `times` and `times_sigmas` are None where there are too few arms.
+
     Attributes:
         tool: the tool's name in the measurements (``tool`` in the options file).
         arms: names of the arms with this tool.
@@ -33,8 +35,7 @@ class ToolUse:
         moved_sigmas: significance of `moved`: the deviation, in σ, of a normal variable with the same probability,
             given the scatter among arms with one tool.
         times: median rms error of these arms, divided by that of the other arms.
-        times_sigmas: significance of log(times), defined as for `moved_sigmas`. The last four attributes are None where
-            there are too few arms.
+        times_sigmas: significance of log(times), defined as for `moved_sigmas`.
     """
 
     tool: str
@@ -103,7 +104,7 @@ def _sigmas(step: np.ndarray, groups: Sequence[np.ndarray]) -> float:
     arm's last link.
 
     Args:
-        step: difference of the two medians.
+        step: (k,) difference of the two medians, such as of positions (k = 3) [m].
         groups: the groups, each (n, k) with one row per arm.
     """
     distances = []

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from datetime import date, datetime
 from pathlib import Path
 
-from calib.apps.monitoring.comparison.calibrations import Calibration, read_fit
-from calib.apps.monitoring.comparison.places import Place, place_of
+from calib.apps.monitoring.comparison.calibration_sources import Place, place_of
+from calib.apps.monitoring.comparison.geometry_calibration import Calibration, read_fit
 from calib.errors import Finding, UsageError, finding, listing, require
 from calib.result_kinds import refusal
 from calib.toolkit.sessions import folders_of
@@ -57,10 +57,10 @@ def visits(calibrations: str | Path | Sequence[str | Path]) -> Visits:
         visits_by_arm.setdefault(arm, []).append((source, calibration))
 
     finished_count = len(places) - len(unfinished)
-    counts = f"{finished_count} of {len(places)} left, nothing to compare"
+    counts = f"{finished_count} of {len(places)} have one, too few to compare"
     message = f"sessions without a verdict yet: {listing(unfinished)}; {counts}"
     enough = finished_count > 1 or not unfinished
-    require(enough, f"{message} (calib next, or calib run, goes on with them)", UsageError)
+    require(enough, f"{message}; continue them with calib next or calib run", UsageError)
 
     unnamed = []
     current = []
@@ -80,10 +80,13 @@ def visits(calibrations: str | Path | Sequence[str | Path]) -> Visits:
 
 
 def _dates(arm_visits: Sequence[Visit]) -> tuple[str, list[date]]:
-    """Return what the dates of one arm's calibrations are dates of ("measurement" or "the session"), and the dates.
+    """Return the kind of dates by which one arm's calibrations are sorted, and the dates.
 
-    The dates of measurement are used if any calibration has one, otherwise the dates on which the sessions were
-    created. The list of dates is empty if a calibration has no such date.
+    The kind is "measurement" if any calibration has a date of measurement, otherwise "the session" (the date on which
+    the session was created). The list of dates is empty if a calibration has no such date.
+
+    Args:
+        arm_visits: the arm's calibrations.
     """
     settings = [source.session.settings for source, _ in arm_visits if source.session]
     dated_thing = "measurement"
@@ -104,6 +107,9 @@ def _in_time(arm_visits: Sequence[Visit]) -> list[Visit]:
     """Return one arm's calibrations, earliest first.
 
     Calibrations of one day remain in the given order; so do all of them where dates are missing.
+
+    Args:
+        arm_visits: the arm's calibrations in the order given by the user.
     """
     _, dates = _dates(arm_visits)
     if not dates:
@@ -113,7 +119,12 @@ def _in_time(arm_visits: Sequence[Visit]) -> list[Visit]:
 
 
 def _current(arm: str, arm_visits: Sequence[Visit]) -> Finding:
-    """Return the finding that names the calibration taken as an arm's current one, and the reason."""
+    """Return the finding that names the calibration taken as an arm's current one, and the reason.
+
+    Args:
+        arm: serial number of the arm.
+        arm_visits: its calibrations in the order given by the user.
+    """
     dated_thing, dates = _dates(arm_visits)
     current = _in_time(arm_visits)[-1][1].name
     last = arm_visits[-1][1].name

@@ -88,6 +88,11 @@ class Step:
 
         The first number is the difference between the best matching interval of the stamps and the step, divided by
         `size`. The place is a text with row and time.
+
+        Args:
+            file: the file with its time stamps.
+            size: size of the step [s].
+            time: approximate time of the step by the file's clock [s].
         """
         intervals = np.diff(file.t)
         row_counts = np.diff(file.rows)
@@ -108,6 +113,9 @@ def find_step(equations: Equations) -> tuple[Step | None, float]:
 
     The step is None where no step is significant. The deviation is 0 where a piecewise linear offset explains the data
     no better than a line.
+
+    Args:
+        equations: least-squares equations of the fit of clock and arm.
     """
     begin, end = float(equations.t.min()), float(equations.t.max())
     # the polygon: offsets at the inner knots, each with a hat function of the time
@@ -142,7 +150,7 @@ def _search(equations: Equations, beside: np.ndarray) -> tuple[Step, float]:
     Times are searched on a coarse grid, then on a fine one.
 
     Args:
-        equations: the equations about the fit.
+        equations: least-squares equations of the fit of clock and arm.
         beside: (n, rows) other changes of the offset [s], whose sizes are estimated too.
     """
     begin, end = float(equations.t.min()), float(equations.t.max())
@@ -156,7 +164,7 @@ def _best(equations: Equations, times: np.ndarray, beside: np.ndarray) -> tuple[
     """Return the most significant of the steps at `times` (k,), and the decrease of the sum of squares by it.
 
     Args:
-        equations: the equations about the fit.
+        equations: least-squares equations of the fit of clock and arm.
         times: candidate times by the instrument's clock [s].
         beside: (n, rows) other changes of the offset [s], whose sizes are estimated too.
     """
@@ -180,13 +188,13 @@ def _best(equations: Equations, times: np.ndarray, beside: np.ndarray) -> tuple[
 
 
 def _projected(equations: Equations, changes: list[np.ndarray]) -> np.ndarray:
-    """Return the residuals that remain after all fitted parameters and backlash are projected out.
+    """Return the residuals (1 + k, rows) that remain after all fitted parameters and backlash are projected out.
 
     The first row is the residual of the right-hand side; each further row is that of one change of the offset.
 
     Args:
-        equations: the equations about the fit.
-        changes: changes (rows,) of the offset [s].
+        equations: least-squares equations of the fit of clock and arm.
+        changes: k changes (rows,) of the clock's offset [s].
     """
     rows, joints = equations.backlash_slopes.shape
     count = len(equations.target)

@@ -127,7 +127,7 @@ class Run:
         return self._path(np.clip(times, start, end), order)
 
     def known(self, clock: Clock, count: int | None = None) -> np.ndarray:
-        """Return the indices of the stream's rows whose times are within the log and outside its gaps.
+        """Return the indices of the stream's rows whose times are within the log and outside the log's gaps.
 
         Args:
             clock: the instrument's clock.
@@ -148,7 +148,12 @@ class Run:
         return [*self.log.lines(), *self.stream.lines()]
 
     def at(self, clock: Clock, rows: np.ndarray) -> Positions:
-        """Return rows of the stream as measurements with their joint values; `rows` (m,) are indices."""
+        """Return rows of the stream as measurements with their joint values.
+
+        Args:
+            clock: the instrument's clock, which determines the joint values.
+            rows: (m,) indices of the rows.
+        """
         return replace(take(self.points, rows), q=self.joints(clock, rows))
 
 
@@ -170,7 +175,11 @@ class _Start:
 def begin(chain: Chain, run: Run) -> tuple[Installation, Clock, tuple[float, ...]]:
     """Return start values: the nominal arm with stations and tools placed, the clock, and other possible offsets [s].
 
-    The other offsets explain the points about as well.
+    With the other offsets, the rms residual is at most `RIVAL` times the smallest one.
+
+    Args:
+        chain: the nominal arm.
+        run: the recordings of controller and instrument.
 
     Raises:
         MeasurementError: no offset brings the points onto the nominal arm's path.
@@ -194,9 +203,9 @@ def begin(chain: Chain, run: Run) -> tuple[Installation, Clock, tuple[float, ...
     if best_misfit > min(MAX_RATIO * extent, MAX_MISFIT * chain.stretched_length()):
         refuse_data(
             run.stream.file,
-            f"at no offset of the clocks its points are on the path of the nominal arm by {run.log.file} (the best "
+            f"no offset of the clocks puts its points on the nominal arm's path of {run.log.file} (the best "
             f"leaves {1e3 * best_misfit:.3g} mm of a motion of {1e3 * extent:.3g} mm): is it the log of this "
-            "motion, and of this robot, did instrument and target stay in place, and did no clock jump? "
+            "motion and of this robot, did instrument and target stay in place, and did no clock jump? "
             f"({'; '.join(run.lines())})",
         )
     alike = [start for start in starts if start.misfit < RIVAL * best_misfit]
@@ -210,7 +219,12 @@ def begin(chain: Chain, run: Run) -> tuple[Installation, Clock, tuple[float, ...
 
 
 def _offsets(chain: Chain, run: Run) -> list[float]:
-    """Return offsets of the clocks [s] at which the speeds of the arm's tip and of the points correlate best."""
+    """Return offsets of the clocks [s] at which the speeds of the arm's tip and of the points correlate best.
+
+    Args:
+        chain: the nominal arm.
+        run: the recordings of controller and instrument.
+    """
     arm = forward(chain, _even(run.log))
     arm_steps = _step_lengths(arm[:, :3, 3])
     rotations = invert(arm[:-1])[:, :3, :3] @ arm[1:, :3, :3]
@@ -256,7 +270,11 @@ def _cut(speed: np.ndarray) -> np.ndarray:
 
 
 def _alike(series_a: np.ndarray, series_b: np.ndarray) -> np.ndarray:
-    """Return the correlation coefficient of two time series at every lag, over the samples where they overlap."""
+    """Return the correlation coefficient of two time series at every lag, over the samples where they overlap.
+
+    Args:
+        series_a, series_b: (a,) and (b,) samples at equal time steps.
+    """
     ones_a, ones_b = np.ones(len(series_a)), np.ones(len(series_b))
     count = np.maximum(np.round(correlate(ones_a, ones_b)), 1.0)
     mean_a = correlate(series_a, ones_b) / count
@@ -269,14 +287,28 @@ def _alike(series_a: np.ndarray, series_b: np.ndarray) -> np.ndarray:
 
 
 def residuals(cell: Installation, run: Run, rows: np.ndarray, clock: Clock) -> np.ndarray:
-    """Return the residuals (3 or 6, m) of the stream's rows: positions [m], then orientations [rad]."""
+    """Return the residuals (3 or 6, m) of the stream's rows: positions [m], then orientations [rad].
+
+    Args:
+        cell: the arm with station and tool.
+        run: the recordings of controller and instrument.
+        rows: (m,) indices of rows of the stream.
+        clock: the instrument's clock, which determines the joint values of the rows.
+    """
     (block,) = prepare(cell, [run.at(clock, rows)])
     parts = observe(cell, block, _NONE)
     return np.concatenate([part.value for part in parts])
 
 
 def velocities(cell: Installation, run: Run, rows: np.ndarray, clock: Clock) -> np.ndarray:
-    """Return velocities (3 or 6, m) [m/s, then rad/s] of the target at the stream's rows, from arm and log."""
+    """Return velocities (3 or 6, m) [m/s, then rad/s] of the target at the stream's rows, from arm and log.
+
+    Args:
+        cell: the arm with station and tool.
+        run: the recordings of controller and instrument.
+        rows: (m,) indices of rows of the stream.
+        clock: the instrument's clock.
+    """
     later = replace(clock, offset=clock.offset + TIME_STEP)
     sooner = replace(clock, offset=clock.offset - TIME_STEP)
     difference = residuals(cell, run, rows, later) - residuals(cell, run, rows, sooner)
@@ -389,7 +421,7 @@ def _sized(
     """Return the prior standard deviations (p,), with those of each family of terms scaled by the most probable factor.
 
     Args:
-        matrix, target: whitened equations of the data, (rows, p) and (rows,).
+        matrix, target: whitened equations matrix · step = target of the data, (rows, p) and (rows,).
         pulled: (p,) the prior's mean minus the current values.
         guess: (p,) prior standard deviations before scaling.
         group: (p,) number of each parameter's family; -1 for parameters that are not terms of an effect.

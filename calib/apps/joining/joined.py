@@ -15,7 +15,7 @@ CLOCKS = ("t", "time", "timestamp", "datetime")
 
 
 def column_of(table: Table, names: Sequence[str]) -> str:
-    """Return the name of the table's first column that is one of `names`; empty if there is none.
+    """Return the name of the table's first column whose name is one of `names`; empty if there is none.
 
     Upper and lower case and punctuation are ignored.
     """

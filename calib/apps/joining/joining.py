@@ -49,7 +49,7 @@ from calib.units import TIMES
 
 METHODS = ("name", "time", "row", "geometry", "motion")
 # requirements of each method except motion, for messages
-REQUIREMENTS = ("both files need a column of names (name, pose, id …)", "of times (t)", "as many rows", "give --robot")
+REQUIREMENTS = ("both files need names (a column name, pose, id …)", "times (column t)", "as many rows", "give --robot")
 
 # Thresholds are our choice.
 # largest distance of two readings of one pose [m], where their scatter is not known
@@ -83,7 +83,9 @@ def join(
         points: CSV file of measured points.
         by: ``name``, ``time``, ``row``, ``geometry`` or ``motion``; empty: the first of these for which both files have
             columns, except ``motion``.
-        robot, base, tip: the nominal robot, as for `calib.load`, by whose geometry the order is checked or found.
+        robot: the nominal robot, by whose geometry the order is checked or found: library name, file, folder of a fit,
+            or in memory; None: not checked.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
 
     Returns:
         The table, the index of each row's pose, and notes; ``write(path)`` writes the CSV that `fit_geometry` reads. By
@@ -99,7 +101,7 @@ def join(
         robot = load_calibrated(robot, base, tip)
     if by == "motion":
         if robot is None:
-            raise UsageError("by motion the clocks are found from the nominal arm's path: give --robot")
+            raise UsageError("joining by motion needs the nominal arm's path: give --robot")
         return join_streams(joints_file, points_file, robot.complete)
     if is_program(joints_file):
         joint_table = joints_table(joints_file)
@@ -131,7 +133,9 @@ def _joined(joints: Table, points: Table, by: str, chain: Chain | None) -> Joine
     elif by == "name":
         pose = _same_names(joints, points, *name_columns)
         if not (pose >= 0).any():
-            raise MeasurementError(f"{points.file}: no name is one of {joints.file}")
+            raise MeasurementError(
+                f"{points.file}: none of its names is in {joints.file}: name the poses alike in both files"
+            )
     else:
         pose = np.arange(len(points))
     if chain is not None and by != "time":
@@ -183,19 +187,19 @@ def ordered(
         limit = 1e3 * MAX_MISFIT * chain.stretched_length()
         refuse_data(
             points.file,
-            f"its {len(measured)} points are not those of these {len(q)} poses in {searched} (within {limit:.0f} mm of "
-            f"the nominal arm): is it this robot and this list, and did instrument and target stay in place?{advice}",
+            f"its {len(measured)} points do not fit the {len(q)} poses in {searched} (within {limit:.0f} mm of "
+            f"the nominal arm): is this the right robot and list, and did instrument and target stay in place?{advice}",
         )
     pose = np.full(len(position), -1)
     pose[measured] = order.pose
     notes = [f"{len(measured)} points, {order.origin} ({1e3 * order.rms:.2g} mm rms from the nominal arm)"]
     strange = measured[order.pose < 0]
     if len(strange):
-        notes.append(f"belonging to no pose, left out: rows {listing(points.rows[strange])}")
+        notes.append(f"left out, since they are near no pose: rows {listing(points.rows[strange])}")
     if order.rivals:
         doubtful = measured[list(order.rivals)]
         pose[doubtful] = -1
-        notes.append(f"poses too close together to tell apart, left out: rows {listing(points.rows[doubtful])}")
+        notes.append(f"left out, since several poses are equally near: rows {listing(points.rows[doubtful])}")
     return pose, tuple(notes)
 
 
@@ -224,7 +228,7 @@ def merged(
     stray = points.rows[pose < 0]
     groups, inconsistent = _consistent(position, groups, label, points)
     if not groups:
-        raise MeasurementError(f"{points.file}: none of its {len(points)} points is left")
+        raise MeasurementError(f"{points.file}: none of its {len(points)} points belongs to a pose of {joints.file}")
     notes = [*notes, *inconsistent]
     if missing and name_missing:
         notes.append(f"without a point: {len(missing)} of {len(joints)} poses: {listing(missing)}")
@@ -255,7 +259,9 @@ def merged(
             errors = position[rows] - position[rows].mean(axis=0)
             squares = squares + (errors**2).sum(axis=0)
         sigma = 1e3 * np.sqrt(squares / repeats)
-        notes.append(f"{counted(repeats, 'repeated reading')} averaged, σ of one {np.mean(sigma):.2g} mm per axis")
+        notes.append(
+            f"{counted(repeats, 'repeated reading')} averaged, σ of one reading {np.mean(sigma):.2g} mm per axis"
+        )
         has_sigma = any(name.startswith("sigma") for name in point_names)
         if repeats >= MIN_REPEATS and not has_sigma and np.all(sigma):
             header += SIGMA.names
@@ -266,7 +272,10 @@ def merged(
 
 
 def _positions(sheet: Sheet) -> np.ndarray:
-    """Return measured positions (m, 3) [m]; NaN where none was measured. Of several targets, the first one is used."""
+    """Return measured positions (m, 3) [m] of the m rows of `sheet`; NaN where none was measured.
+
+    Of several targets, the first one is used.
+    """
     columns = sheet.family(POSITION.names) or sheet.family(POSITION.names, "1")
     if not columns:
         refuse_data(sheet.table.file, f"has no x, y, z; found {', '.join(sheet.table.header)}")
@@ -305,6 +314,12 @@ def _averaged(points: Table, name: str, groups: dict[int, np.ndarray], position:
     """Return a column of the points with one cell per group of readings.
 
     The cell is the mean for measured numbers; otherwise it is the cell of the reading nearest to the mean position.
+
+    Args:
+        points: table of the m points.
+        name: name of the column.
+        groups: pose to indices of its readings.
+        position: (m, 3) measured positions [m].
     """
     cells = points.cells[points.index(name)]
     if _MEASURED.fullmatch(name) and cells.dtype == float:
@@ -326,7 +341,12 @@ def _labels(joints: Table) -> list[str]:
 
 
 def _same_names(joints: Table, points: Table, joint_column: str, point_column: str) -> np.ndarray:
-    """Return for each point the row of joints with the point's name, (m,); -1 where no row has it."""
+    """Return for each point the row of joints with the point's name, (m,); -1 where no row has it.
+
+    Args:
+        joints, points: tables of joint values and of points.
+        joint_column, point_column: names of the columns with the names of poses.
+    """
     point_names = points.texts(point_column)
     joint_names = joints.texts(joint_column)
     # first by the whole names, then by their numbers
@@ -341,7 +361,7 @@ def _same_names(joints: Table, points: Table, joint_column: str, point_column: s
 
 
 def _plain(text: str) -> str:
-    """Return a name in comparable form: lower-case letters and digits, without leading zeros.
+    """Return the name `text` in comparable form: lower-case letters and digits, without leading zeros.
 
     ``P_007`` becomes ``p7``.
     """
@@ -350,7 +370,7 @@ def _plain(text: str) -> str:
 
 
 def _number(text: str) -> str:
-    """Return the last number in a name without leading zeros, or the whole name where it has no number."""
+    """Return the last number in the name `text` without leading zeros; the whole name if it has no number."""
     numbers = re.findall(r"\d+", text) or [text]
     return numbers[-1].lstrip("0")
 
@@ -403,12 +423,21 @@ def _at_times(
 
 
 def _interpolated(times: np.ndarray, t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the values (N, k) of series at times t (N,), linearly interpolated at `times` (m,): (m, k)."""
+    """Return the values of a time series, linearly interpolated at other times: (m, k).
+
+    Args:
+        times: (m,) times of the result [s].
+        t: (N,) times of the series [s], rising.
+        values: (N, k) the series.
+    """
     return np.column_stack([np.interp(times, t, column) for column in values.T])
 
 
 def _seconds(table: Table, name: str) -> np.ndarray:
-    """Return a column of times (m,) [s]: numbers in the header's unit, or ISO 8601 dates and times."""
+    """Return the column `name` of a table as times (m,) [s].
+
+    The column contains numbers in the header's unit, or ISO 8601 dates and times.
+    """
     column = table.index(name)
     if table.cells[column].dtype == float:
         return table.numbers(name, None) * table.factor(column, TIMES, "")

@@ -51,7 +51,8 @@ class Order:
     Attributes:
         pose: (m,) index of each point's pose, -1 for none; several readings of one pose have the same index.
         error: (m,) distance of each point from the point that the nominal arm predicts for that pose [m].
-        rivals: indices of points that another pose explains about as well.
+        rivals: indices of points that another pose explains nearly as well, with an error below `AMBIGUOUS` times the
+            rms.
         origin: how the order was found, in words.
     """
 
@@ -107,7 +108,15 @@ def find_order(chain: Chain, q: np.ndarray, points: np.ndarray, candidates: dict
 def _orders_from(
     chain: Chain, q: np.ndarray, points: np.ndarray, starts: Iterable[np.ndarray], limit: float
 ) -> list[Order]:
-    """Return the orders refined from each start, up to the first that assigns nearly all points to poses."""
+    """Return the orders refined from each start, up to the first order that assigns nearly all points to poses.
+
+    Args:
+        chain: the nominal arm.
+        q: (n, joints) joint values of the poses [rad or m].
+        points: (m, 3) measured positions [m].
+        starts: orders to begin from, each (m,) the index of each point's pose, -1 for none.
+        limit: largest distance of a point from its pose's predicted point [m].
+    """
     orders = list[Order]()
     for pose in starts:
         order = _refined(chain, q, points, pose, limit)
@@ -166,9 +175,19 @@ def _refined(
 def _predicted(
     chain: Chain, q: np.ndarray, points: np.ndarray, pose: np.ndarray, assigned: np.ndarray
 ) -> np.ndarray | None:
-    """Return the predicted points (n, 3) [m] of all poses, with instrument and target placed by the `assigned` points.
+    """Return the predicted points (n, 3) [m] of all poses, in the instrument's frame.
 
-    None if the assigned points do not determine the placement.
+    Instrument and target are placed by least squares over the assigned points.
+
+    Args:
+        chain: the nominal arm.
+        q: (n, joints) joint values of the poses [rad or m].
+        points: (m, 3) measured positions [m].
+        pose: (m,) index of each point's pose.
+        assigned: indices or mask of the points to use.
+
+    Returns:
+        The points; None if the assigned points do not determine the placement.
     """
     block = PoseMeasurements.of(q[pose[assigned]], points[assigned], joint_names=chain.joint_names)
     try:
@@ -183,7 +202,7 @@ def _assigned(cost: np.ndarray, bound: float, prefer: np.ndarray | None) -> np.n
     """Return the pose (m,) of each point by the assignment of least total clipped cost; -1 for costs above `bound`.
 
     Args:
-        cost: (m, n) cost of assigning each point to each pose.
+        cost: (m, n) cost of assigning each point to each pose: their distance [m].
         bound: value at which costs are clipped.
         prefer: (m,) poses that are taken where their cost is below `bound`, -1 for none; None: no preference.
     """
@@ -200,7 +219,13 @@ def _assigned(cost: np.ndarray, bound: float, prefer: np.ndarray | None) -> np.n
 
 
 def _by_distances(arm: np.ndarray, points: np.ndarray, tools: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    """Yield start orders (m,) from the best of many triples of poses whose distances match those of measured points."""
+    """Yield start orders (m,) from the best of many triples of poses whose distances match those of measured points.
+
+    Args:
+        arm: (n, 4, 4) poses of the nominal arm's tip.
+        points: (m, 3) measured positions [m].
+        tools: possible positions (3,) of the target in the tip's frame [m], to be tried one after the other.
+    """
     rng = np.random.default_rng(0)
     scored_points = rng.permutation(len(points))[:SCORED]
     bound = 0.06 * float(np.linalg.norm(np.std(points, axis=0)))
@@ -237,6 +262,10 @@ def _tools(arm: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
     """Return possible positions (3,) of the target in the tip's frame [m].
 
     For these, the distances between predicted points are distributed most like those between measured points.
+
+    Args:
+        arm: (n, 4, 4) poses of the nominal arm's tip.
+        points: (m, 3) measured positions [m].
     """
     share = np.linspace(0.02, 0.98, 60)
     measured = np.quantile(pdist(points), share)
@@ -252,7 +281,12 @@ def _tools(arm: np.ndarray, points: np.ndarray) -> list[np.ndarray]:
 
 
 def _wide_triples(points: np.ndarray, rng: np.random.Generator) -> Iterator[np.ndarray]:
-    """Yield triples of indices of points that span large triangles."""
+    """Yield triples of indices of points that span large triangles.
+
+    Args:
+        points: (m, 3) positions [m].
+        rng: generator for the choice of triples.
+    """
     drawn = np.array([rng.permutation(len(points))[:3] for _ in range(20 * TRIPLES)])
     a, b, c = np.moveaxis(points[drawn], 1, 0)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1)

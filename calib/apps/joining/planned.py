@@ -38,6 +38,11 @@ def read_planned(path: Path, chain: Chain, options: FileOptions) -> list[PoseMea
     Poses are identified by the numbers in the points' names, otherwise by the order of the rows. Where the nominal arm
     contradicts both, the order is found from the arm's geometry (`calib.apps.joining.order`).
 
+    Args:
+        path: the file of the points.
+        chain: the nominal arm.
+        options: how the file is read; ``planned`` is the file of the planned poses.
+
     Returns:
         One block; an empty list where the file has joint columns, or no positions.
 
@@ -76,7 +81,12 @@ def read_planned(path: Path, chain: Chain, options: FileOptions) -> list[PoseMea
 
 
 def _stated_orders(points: Table, count: int) -> dict[str, np.ndarray]:
-    """Return the orders that the file suggests, by names or by rows: description to (m,) index of each point's pose."""
+    """Return the orders that the file suggests, by names or by rows: description to (m,) index of each point's pose.
+
+    Args:
+        points: table of the m points.
+        count: number of planned poses.
+    """
     orders = dict[str, np.ndarray]()
     name = column_of(points, NAMES)
     if name:
@@ -102,7 +112,14 @@ def _in_plan(pose: np.ndarray, count: int) -> np.ndarray:
 
 
 def _stop_sigma(chain: Chain, q: np.ndarray) -> np.ndarray:
-    """Return the standard deviation (m,) [m] per axis of the tip's position if each joint has that of `SIGMA_JOINT`."""
+    """Return the standard deviation (m,) [m] per axis of the tip's position due to the accuracy of stopping.
+
+    Each joint is assumed to have the standard deviation `SIGMA_JOINT`.
+
+    Args:
+        chain: the arm.
+        q: (m, n) joint values [rad or m].
+    """
     squares = []
     for axis in np.eye(chain.n):
         ahead = forward(chain, q + STEP * axis)

@@ -35,7 +35,7 @@ MIN_ROWS = 200
 # smallest jump back of a clock that was restarted [s]
 RESTART = 1.0
 # reasons for which rows are ignored, for messages
-DAMAGED, LATE = "damaged, empty or not seen", "with a time not after the row before"
+DAMAGED, LATE = "damaged, empty or not seen", "with a time not after that of the row before"
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,11 @@ class _Part:
 
 
 def _reasons(dropped: Counter[str]) -> str:
-    """Return as text how many rows were left out for each reason; empty if no row was."""
+    """Return as text how many rows were left out for each reason; empty if no row was left out.
+
+    Args:
+        dropped: reason to number of rows.
+    """
     return ", ".join(f"{count} {reason}" for reason, count in dropped.items() if count)
 
 
@@ -181,7 +185,7 @@ def read_stream(path: Path, kind: Kind) -> Stream:
         reasons = _reasons(dropped)
         if reasons:
             message += f" ({reasons})"
-        refuse_data(path, f"{message}: is it a stream, and one recording?")
+        refuse_data(path, f"{message}: is it a stream, recorded without interruption?")
     parts = [part for part in parts if len(part.t)]
     t = np.concatenate([part.t for part in parts])
     values = np.concatenate([part.values for part in parts])
@@ -243,7 +247,12 @@ def _clock(table: Table) -> str:
 
 
 def _step(t: np.ndarray, table: Table) -> float:
-    """Return the median time between rows [s]; raise MeasurementError for a file measured at stops."""
+    """Return the median time between rows [s]; raise MeasurementError for a file measured at stops.
+
+    Args:
+        t: (m,) times of the rows [s].
+        table: the file's table, which the message names.
+    """
     step = float(np.median(np.diff(t)))
     if step > SLOWEST:
         message = f"its rows are {step:.3g} s apart, a stream's {SLOWEST:g} s at most. Is t in ms ('t [ms]')?"
@@ -283,7 +292,13 @@ def _data_lines(lines: Iterable[str]) -> Iterator[str]:
 
 
 def _row(line: str, separator: str, width: int) -> list[float]:
-    """Return the numbers of a line; all NaN if it does not have `width` cells."""
+    """Return the numbers of a line; all NaN if it does not have `width` cells.
+
+    Args:
+        line: the line.
+        separator: character between cells; a blank is any white space.
+        width: expected number of cells.
+    """
     cells = line.split() if separator == " " else line.split(separator)
     if len(cells) != width:
         return [np.nan] * width

@@ -69,7 +69,7 @@ class Streamed(Joined):
         clock: the instrument's clock.
         sigma: robust standard deviation of the position residuals, per axis [m].
         correlation: correlation time τ of the residuals before thinning [s].
-        factor: √τ with τ in steps: the factor by which sigmas would be too small if all rows were fitted.
+        factor: √(τ / time between rows), the factor by which sigmas would be too small if all rows were fitted.
         left: correlation of neighbouring residuals after thinning.
     """
 
@@ -86,12 +86,12 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
     Thinning keeps rows whose errors are independent.
 
     Args:
-        log_file: times and joint values, by the controller's clock.
-        file: times and positions, with or without quaternions, by the instrument's clock.
+        log_file: file with times and joint values, by the controller's clock.
+        file: file with times and positions, with or without quaternions, by the instrument's clock.
         chain: the nominal arm.
 
     Raises:
-        MeasurementError: the files are no streams, the arm hardly moves, or the files are not of the same motion.
+        MeasurementError: the files are no streams, the arm moves too little, or the files are not of the same motion.
     """
     log = read_stream(log_file, _joints(chain))
     stream = _fresh(read_stream(file, _target()))
@@ -133,7 +133,7 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
     if len(rows) < MIN_ROWS:
         notes = "; ".join([*run.lines(), *lines_of([thinned])])
         message = (
-            "too few rows are independent: did a clock jump, or instrument or target move? Else measure for longer"
+            "too few rows are independent: did a clock jump, or did instrument or target move? Else measure for longer"
         )
         refuse_data(file, f"{message}, over more of the workspace ({notes})")
 
@@ -187,10 +187,16 @@ def join_streams(log_file: Path, file: Path, chain: Chain) -> Streamed:
 
 
 def _check_motion(recording: Stream, count: int, unit: str) -> None:
-    """Raise MeasurementError for a recording whose first `count` columns hardly change; `unit` is printed with them."""
+    """Raise MeasurementError for a recording in which no quantity changes by more than `MIN_MOTION`.
+
+    Args:
+        recording: the recording.
+        count: number of columns to check, from the first one on.
+        unit: unit of the columns, for the message.
+    """
     travel = float(np.ptp(recording.values[:, :count], axis=0).max())
     if not travel > MIN_MOTION:
-        message = f"hardly moves (by {travel:.2g}{unit}), and without motion no clock is found: is the unit right?"
+        message = f"moves by only {travel:.2g}{unit}, too little to identify the clocks' offset: is the unit right?"
         refuse_data(recording.file, message)
 
 
@@ -205,7 +211,7 @@ def _refuse(step: Step | None, wander: float, run: Run, clock: Clock) -> NoRetur
     """
     file = run.stream.file
     if step is None:
-        message = f"the clocks' offset leaves a line of offset and drift by {1e3 * wander:.2g} ms"
+        message = f"the clocks' offset deviates from a line of offset and drift by {1e3 * wander:.2g} ms"
         refuse_data(file, f"{message}: cut the file into shorter parts, and join each part on its own")
     size = f"{1e3 * step.size:+.3g} ± {1e3 * step.sigma:.2g} ms"
     log_time = float(clock.controller(np.array(step.time)))
@@ -219,6 +225,11 @@ def _usable(cell: Installation, run: Run, clock: Clock) -> tuple[np.ndarray, np.
 
     Unusable rows are counted in the stream. Residuals are taken to have the variance σ² across the motion, and σ² + v²
     σ_t² along the motion at speed v, with σ_t the uncertainty of the time.
+
+    Args:
+        cell: the fitted arm with station and tool.
+        run: the recordings of controller and instrument.
+        clock: the fitted clock.
     """
     stream = run.stream
     usable = run.known(clock)
@@ -246,7 +257,11 @@ def _usable(cell: Installation, run: Run, clock: Clock) -> tuple[np.ndarray, np.
 
 
 def _joints(chain: Chain) -> Kind:
-    """Return how a log's joint values are read and checked: columns, units and joint limits."""
+    """Return how a log's joint values are read and checked for an arm: columns, units and joint limits.
+
+    Args:
+        chain: the arm.
+    """
     robot = joints_of(chain)
     # limits, and for a joint without any a bound of the right unit
     travel = max_travel(robot.kinds)

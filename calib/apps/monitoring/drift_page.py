@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.apps.monitoring import pages
+from calib.apps.monitoring import report_folder
 from calib.apps.monitoring.settings import DEFAULT_DRIFT, DriftSettings
 from calib.arguments import checked
 from calib.errors import Finding, UsageError, require
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 TABLE = "trends.csv"
 HEADER = ("column", "unit", "x", "dx [mm]", "dy [mm]", "dz [mm]")
-CAPTION = "Targets of repeated poses less the arm's prediction."
+CAPTION = "Targets of repeated poses minus the arm's prediction."
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +68,11 @@ class DriftFound(ChartedResult, ReportedResult):
             RecordColumn("poses", "{0.poses}"),
             RecordColumn("visits", "{0.x.size}"),
             RecordColumn("slope", _rate),
-            RecordColumn("x mm", lambda trend: f"{1e3 * trend.slope[0]:+.2g}"),
-            RecordColumn("y mm", lambda trend: f"{1e3 * trend.slope[1]:+.2g}"),
-            RecordColumn("z mm", lambda trend: f"{1e3 * trend.slope[2]:+.2g}"),
-            RecordColumn("in all mm", lambda trend: f"{1e3 * trend.total:.3g}"),
-            RecordColumn("σ", lambda trend: f"{trend.sigmas:.1f}"),
+            RecordColumn("x mm", _slope_x_mm),
+            RecordColumn("y mm", _slope_y_mm),
+            RecordColumn("z mm", _slope_z_mm),
+            RecordColumn("in all mm", _total_mm),
+            RecordColumn("σ", "{0.sigmas:.1f}"),
         ]
         blocks = [Text("Notes", notes_of(self.noticed), "note"), table("Drift of the target", columns, self.trends)]
         return Section("Drift", blocks, self.verdict.level, self.verdict.reason)
@@ -100,6 +100,10 @@ class DriftFound(ChartedResult, ReportedResult):
         """Write the result into a folder and return its path.
 
         The folder contains report.html, trends.csv, metrics.json, and the figure as PNG.
+
+        Args:
+            out: the folder.
+            plots: whether figures are drawn.
         """
         rows: list[tuple[object, ...]] = []
         for trend in self.trends:
@@ -108,7 +112,7 @@ class DriftFound(ChartedResult, ReportedResult):
         charts: dict[str, Chart] = {}
         if plots:
             charts = self.charts()
-        part = pages.ResultPart(self.section(), charts, [CAPTION], (TABLE, HEADER, rows))
+        part = report_folder.ResultPart(self.section(), charts, [CAPTION], (TABLE, HEADER, rows))
         verdict = self.verdict
         numbers: dict[str, object] = {
             "robot": self.robot,
@@ -124,11 +128,27 @@ class DriftFound(ChartedResult, ReportedResult):
                 "total": trend.total,
             }
         title = f"Drift of {self.robot}"
-        return pages.save(Path(out), "drift", title, {"robot": self.robot}, [part], plain(numbers), [TABLE])
+        return report_folder.save(Path(out), "drift", title, {"robot": self.robot}, [part], plain(numbers), [TABLE])
 
 
 def _rate(trend: Trend) -> str:
     return f"{1e3 * trend.size:.2g} ± {1e3 * trend.sigma:.1g} mm/{trend.unit}"
+
+
+def _slope_x_mm(trend: Trend) -> str:
+    return f"{1e3 * trend.slope[0]:+.2g}"
+
+
+def _slope_y_mm(trend: Trend) -> str:
+    return f"{1e3 * trend.slope[1]:+.2g}"
+
+
+def _slope_z_mm(trend: Trend) -> str:
+    return f"{1e3 * trend.slope[2]:+.2g}"
+
+
+def _total_mm(trend: Trend) -> str:
+    return f"{1e3 * trend.total:.3g}"
 
 
 def drift(
@@ -142,11 +162,12 @@ def drift(
     """Return how the target drifts with time and temperature, from poses that were measured more than once.
 
     Args:
-        robot, base, tip: the arm, as for `calib.load`.
+        robot: the arm: library name, file (URDF, or MDH table in TOML), or folder of a fit.
         measured: CSV files with some poses measured several times, and columns ``time`` or ``temperature``; all from
             one station of the instrument.
         settings: displacement above which the drift is not acceptable, and σ of the instrument.
-        options: as for `fit_geometry`.
+        options: options for reading the files (`calib formats options`): TOML file, or in memory; None: defaults.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
 
     Raises:
         UsageError: no pose was measured twice.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.apps.monitoring import pages
+from calib.apps.monitoring import report_folder
 from calib.apps.monitoring.comparison.change_part import plus_minus
 from calib.apps.monitoring.comparison.change_test import ParameterChange
 from calib.apps.monitoring.comparison.geometry_change import GeometryChange
@@ -95,7 +95,11 @@ class LogLine:
         return f"{change.name} {plus_minus(change.alone, change.alone_sigma, change.unit)}"
 
     def row(self, robot: str) -> tuple[object, ...]:
-        """Return the cells of the log's table, in the order of `HEADER`."""
+        """Return the cells of the log's table for this calibration, in the order of `HEADER`.
+
+        Args:
+            robot: name of the robot.
+        """
         nominal, calibrated = self.errors or (None, None)
         motion, sigma = self.moved or (None, None)
         change: tuple[object, ...] = ("", None, None, "")
@@ -151,7 +155,7 @@ class RobotLog(ChartedResult, ReportedResult, WithoutVerdict):
         ]
         panels = [
             Panel(errors_drawn, "error on unseen poses [mm]", xnames=dates),
-            Panel(motion_drawn, "the tool moved since the one before [mm]", xnames=dates),
+            Panel(motion_drawn, "motion of the tool since the last calibration [mm]", xnames=dates),
         ]
         return {"log": Chart(panels, 2.6, 2)}
 
@@ -159,16 +163,22 @@ class RobotLog(ChartedResult, ReportedResult, WithoutVerdict):
         """Write the log into a folder and return its path.
 
         The folder contains report.html, log.csv, metrics.json, and the figure as PNG.
+
+        Args:
+            out: the folder.
+            plots: whether figures are drawn.
         """
         charts: dict[str, Chart] = {}
         if plots:
             charts = self.charts()
         rows = [log_line.row(self.robot) for log_line in self.lines]
-        part = pages.ResultPart(self.section(), charts, ["Errors, and motion of the tool."], (TABLE, HEADER, rows))
+        part = report_folder.ResultPart(
+            self.section(), charts, ["Errors, and motion of the tool."], (TABLE, HEADER, rows)
+        )
         lines = [dict(zip(HEADER, row)) for row in rows]
         numbers = plain({"robot": self.robot, "lines": lines})
         title = f"Calibrations of {self.robot}"
-        return pages.save(Path(out), "log", title, {"robot": self.robot}, [part], numbers, [TABLE])
+        return report_folder.save(Path(out), "log", title, {"robot": self.robot}, [part], numbers, [TABLE])
 
 
 def _nominal_error(log_line: LogLine) -> str:
@@ -239,12 +249,15 @@ def log(folders: Sequence[str | Path], *, mixed: bool = False) -> RobotLog:
 
 
 def _check_same(attribute: str, names: Sequence[str], mixed: bool) -> None:
-    """Raise UsageError if sessions have different names (or serial numbers), unless `mixed`.
+    """Raise UsageError if sessions have different names (or serial numbers) of the robot, unless `mixed`.
 
-    Empty names are ignored.
+    Args:
+        attribute: what differs, for the message, such as "serial numbers".
+        names: name or serial number of each session; empty texts are ignored.
+        mixed: whether different ones are accepted.
     """
     different = list(dict.fromkeys(name for name in names if name))
-    message = f"the sessions have different {attribute} ({', '.join(different)}); --mixed takes them for one robot"
+    message = f"the sessions have different {attribute} ({', '.join(different)}); give --mixed if they are of one robot"
     require(len(different) < 2 or mixed, message, UsageError)
 
 

@@ -94,14 +94,18 @@ class Placements(GeometryFit):
         return tuple(frames)
 
     def lines(self, *first: str) -> Iterator[str]:
-        """Yield the console lines: verdict, residual, and the frames whose names begin with one of `first`."""
+        """Yield the console lines: verdict, residual, and frames.
+
+        Args:
+            *first: beginnings of the names of the frames to print.
+        """
         poses = self.fit.poses
         yield str(self.verdict)
         for frame in self.placed:
             if frame.name.startswith(first):
                 yield str(frame)
         rms_mm = 1e3 * self.fit.errors[1].rms
-        yield f"{poses} poses, {rms_mm:.3g} mm rms residual; σ follows from it, the arm's random errors included"
+        yield f"{poses} poses, {rms_mm:.3g} mm rms residual (with the arm's random errors), from which σ is computed"
         yield from map(str, self.warnings)
         if poses < USUAL_POSES:
             yield f"{poses} poses are few: measure {USUAL_POSES}, with the wrist turned by 90° and more between them"
@@ -111,7 +115,11 @@ class Placements(GeometryFit):
 
 
 def _turned(pose: np.ndarray) -> np.ndarray:
-    """Return the Jacobian (6, 6) of small motions along the reference axes by those along a frame's own axes."""
+    """Return the Jacobian (6, 6) of small motions along the reference axes by those along a frame's own axes.
+
+    Args:
+        pose: (4, 4) pose of the frame in the reference frame.
+    """
     return np.kron(np.eye(2), pose[:3, :3])
 
 
@@ -141,7 +149,11 @@ def _sigma(estimate: Estimate, name: str, jacobian: np.ndarray) -> np.ndarray:
 
 
 def _stated(values: np.ndarray, sigmas: np.ndarray) -> str:
-    """Return as text values with three decimals and their standard deviations, both in one unit."""
+    """Return as text values with three decimals and their standard deviations.
+
+    Args:
+        values, sigmas: values and standard deviations, in one unit.
+    """
     texts = []
     for value, sigma in zip(values, sigmas):
         if np.isnan(sigma):
@@ -164,10 +176,13 @@ def tool(
     """Calibrate the tool (TCP): the target's placement in the arm's tip, from a dozen measured poses.
 
     Args:
-        robot, base, tip: the arm, as for `calib.load`; its geometry is not changed.
-        measured: CSV files, folders of images, or the result of `read_poses`, as for `fit_geometry`.
+        robot: the arm, whose geometry is not changed: library name, file (URDF, or MDH table in TOML), folder of a fit,
+            or a robot in memory.
+        measured: one or several CSV files of measured poses, folders of images, or results of `read_poses`.
         settings: tolerance, and share of the poses to hold out.
-        options, progress: as for `fit_geometry`.
+        options: options for reading the files (`calib formats options`): TOML file, or in memory; None: defaults.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
+        progress: called with a text on each step; None: no report.
 
     Returns:
         The fit: ``placed`` has the frames with σ, ``verdict`` the verdict.

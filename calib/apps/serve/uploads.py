@@ -30,7 +30,7 @@ def targets(session: Session, kind: str, names: list[str]) -> list[Path]:
         last_part = name.replace("\\", "/").rpartition("/")[2]
         plain.append(last_part.lstrip("."))
     distinct = all(plain) and len(set(plain)) == len(plain)
-    require(distinct, "two files of one name, or one without: rename them", UsageError)
+    require(distinct, "two uploaded files have the same name, or one has no name: rename them", UsageError)
 
     subject = "log"
     suffixes: tuple[str, ...] = (".csv",)
@@ -55,7 +55,7 @@ def targets(session: Session, kind: str, names: list[str]) -> list[Path]:
         message = f"{name}: expected {' or '.join(suffixes)}; nothing was stored"
         require(name.lower().endswith(suffixes), message, UsageError)
         for start in other_prefixes:
-            message = f"{name}: a name that begins with '{start}' says other files; upload it there, or rename it"
+            message = f"{name}: files named '{start}…' have another upload on this page; use that, or rename it"
             require(not name.lower().startswith(start), message, UsageError)
         stored_name = name
         if not name.lower().startswith(prefix):

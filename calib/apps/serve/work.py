@@ -75,7 +75,12 @@ class Work:
     def ask(self, task: str, subject: str = "") -> bool:
         """Queue a job and return whether it was queued.
 
-        It is not if it is already queued, or if it is a run and another run is queued or in progress.
+        A job is not queued if an equal one is already queued, or if it is a run and another run is queued or in
+        progress.
+
+        Args:
+            task: `CHECK`, `NEXT` or `REDO`.
+            subject: the kind of files to check, or the step to repeat; empty for `NEXT`.
         """
         with self._lock:
             jobs = list(self._waiting)
@@ -130,7 +135,14 @@ class Work:
 
 
 def _run(sender: Connection, folder: Path, task: str, subject: str) -> None:
-    """Run a job in this (separate) process, and send its messages through the pipe `sender`."""
+    """Run a job in this (separate) process, and send its messages through a pipe.
+
+    Args:
+        sender: the pipe.
+        folder: the session's folder.
+        task: `CHECK`, `NEXT` or `REDO`.
+        subject: the kind of files to check, or the step to repeat; empty for `NEXT`.
+    """
     from calib.toolkit.sessions import go_on
 
     def send(kind: str, text: object) -> None:
@@ -158,7 +170,11 @@ def _run(sender: Connection, folder: Path, task: str, subject: str) -> None:
 
 
 def checked(session: Session, kind: str) -> list[str]:
-    """Check uploaded files of one kind as the session's step would, and return notes on them.
+    """Check uploaded files as the session's step would, and return notes on them.
+
+    Args:
+        session: the session.
+        kind: kind of the files, a key of `calib.apps.serve.uploads.BROUGHT`.
 
     Raises:
         CalibError: files that the step would refuse.

@@ -255,7 +255,7 @@ def _paths(files: Sequence[str | Path]) -> list[Path]:
 
 
 def _parse(path: Path) -> StudyFile:
-    """Return the content of a study file.
+    """Return the content of the study file at `path`.
 
     Raises:
         UsageError: a file that `calib.config.parse` refuses, or an unknown method.
@@ -332,7 +332,12 @@ def _counts(study: StudyFile, methods: Sequence[str] | None, runs: int | None) -
 
 
 def _runs_of(study: StudyFile, name: str) -> int:
-    """Return the number of runs that a study file sets for a method, or for methods of its kind."""
+    """Return the number of runs that a study file sets for a method, or for methods of its kind.
+
+    Args:
+        study: the study file.
+        name: name of the method.
+    """
     method = METHODS[name]
     runs = None
     if method.needs_controller:

@@ -108,7 +108,7 @@ class Experiment:
         problem: input of a method.
         model: identification model of the problem.
         truth: (b,) true values of the model's base parameters.
-        matrix: (K, n, b) base regressor of the assumed robot along the validation motion.
+        matrix: (K, n, b) base regressor of the assumed robot at K samples of the validation motion.
         torque: (K, n) noise-free torques of the true robot along the validation motion, without its unknown payload [N
             m].
     """
@@ -130,7 +130,13 @@ def set_up(condition: Condition) -> Setup:
 
 @lru_cache(maxsize=4)
 def _set_up(robot: str, duration: float, motion: str) -> Setup:
-    """Return the data common to all data sets of a robot and a motion, logged at the robot's own rate."""
+    """Return the data common to all data sets of a robot and a motion, logged at the robot's own rate.
+
+    Args:
+        robot: name of the robot, one of `ROBOTS`.
+        duration: duration of the motion [s].
+        motion: one of `MOTIONS`, or the folder of a motion by `calib excite`.
+    """
     chain = load(robot)
     plant = known_plant(robot)
     control = known_truth(robot)["control"]
@@ -151,7 +157,14 @@ def _set_up(robot: str, duration: float, motion: str) -> Setup:
 
 
 def _best_random_motion(robot: str, chain: Chain, duration: float, rate: float) -> Reference:
-    """Return the one of `MOTION_TRIES` random motions whose base regressor has the smallest condition number."""
+    """Return the one of `MOTION_TRIES` random motions whose base regressor has the smallest condition number.
+
+    Args:
+        robot: name of the robot.
+        chain: its nominal geometry.
+        duration: duration of the motion [s].
+        rate: sampling rate of the motion [Hz].
+    """
     model = plant_model(known_plant(robot))
     base_columns = _nominal_base(robot).kept
     part = slice(None, None, 2 * THIN)
@@ -166,7 +179,14 @@ def _best_random_motion(robot: str, chain: Chain, duration: float, rate: float) 
 
 
 def _drawn(chain: Chain, duration: float, rate: float, number: int) -> Reference:
-    """Return the random Fourier series with seed `number` within the joint limits; reproducible."""
+    """Return a random Fourier series within the joint limits; reproducible.
+
+    Args:
+        chain: the arm with its limits.
+        duration: duration of the motion [s].
+        rate: sampling rate of the motion [Hz].
+        number: seed of the series.
+    """
     lower, upper = chain.sampling_limits()
     middle, half = 0.5 * (lower + upper), 0.5 * REACH * (upper - lower)
     speed = SPEED * np.array([joint.velocity for joint in chain.joints])
@@ -261,7 +281,13 @@ class _Robots:
 
 
 def _robots(condition: Condition, setup: Setup, seed: int) -> _Robots:
-    """Return the true and the assumed robot of a data set, which differ by the condition's mismatch."""
+    """Return the true and the assumed robot of a data set, which differ by the condition's mismatch.
+
+    Args:
+        condition: the condition.
+        setup: the data common to all data sets of the condition.
+        seed: seed of the data set.
+    """
     plant = setup.plant
     chain = setup.chain
     robots = _Robots(plant, plant_model(plant), _nominal_base(condition.robot), plant)
@@ -291,7 +317,15 @@ def _robots(condition: Condition, setup: Setup, seed: int) -> _Robots:
 
 
 def _recorded(condition: Condition, setup: Setup, true: Plant, controller: LoopController, seed: int) -> Case:
-    """Return the recording of one noisy run of the true robot in its control loop."""
+    """Return the recording of one noisy run of the true robot in its control loop.
+
+    Args:
+        condition: the condition, which gives the noise.
+        setup: the data common to all data sets of the condition.
+        true: the simulated robot.
+        controller: its controller.
+        seed: seed of the noise.
+    """
     sensing = Sensing(condition.sigma_q, 0.0, condition.sigma_tau, every=setup.every)
 
     def run(every: float) -> SimulatedRun:
@@ -315,7 +349,12 @@ def _recorded(condition: Condition, setup: Setup, true: Plant, controller: LoopC
 
 
 def _loop(condition: Condition, controller: LoopController) -> LoopSettings:
-    """Return the control loop that the methods assume, with wrong gains if this is the condition's mismatch."""
+    """Return the control loop that the methods assume, with wrong gains if this is the condition's mismatch.
+
+    Args:
+        condition: the condition.
+        controller: the controller of the simulated robot.
+    """
     kp = kd = 1.0
     if condition.mismatch == "controller":
         kp, kd = BELIEVED

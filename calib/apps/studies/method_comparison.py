@@ -120,8 +120,9 @@ def compare_methods(
     Args:
         inputs: training recordings, and held-out ones.
         methods: names of methods; None: all.
-        friction: as in `IdentificationSettings`; methods that simulate support only ``standard``.
-        say: called with messages on progress.
+        friction: friction model: ``standard``, ``auto``, or a step of the ladder; methods that simulate support only
+            ``standard``.
+        say: called with each message on progress.
         done: called with each method's result as soon as it is available, not yet ranked.
 
     Raises:
@@ -130,7 +131,9 @@ def compare_methods(
     require(inputs.unseen, "methods are ranked on unseen motion: give a recording with --validate", UsageError)
     shared = overlaps(inputs.cases, inputs.unseen)
     if shared:
-        raise UsageError(f"{lines_of(shared)[0]}: cut them apart, log.npz@0:20 and log.npz@20:30")
+        raise UsageError(
+            f"{lines_of(shared)[0]}: state parts that do not overlap, such as log.npz@0:20 and log.npz@20:30"
+        )
     # Recordings that repeat the training motion do not rank methods, unless there are no others.
     repeated = repeated_motion(inputs.cases, inputs.unseen)
     validation = tuple(case for case in inputs.unseen if case.name not in repeated)
@@ -172,7 +175,12 @@ def compare_methods(
 
 
 def caveats(inputs: IdentificationInputs, compared: Sequence[ComparedMethod]) -> list[Note]:
-    """Return notes on a ranking, and the reason if no method is recommended."""
+    """Return notes on a ranking, and the reason if no method is recommended.
+
+    Args:
+        inputs: the recordings.
+        compared: results of the methods, best first.
+    """
     repeated = repeated_motion(inputs.cases, inputs.unseen)
     notes = [Note(note) for note in inputs.currents.notes]
     notes += notes_of(motion_findings({}, repeated))
@@ -192,7 +200,9 @@ def caveats(inputs: IdentificationInputs, compared: Sequence[ComparedMethod]) ->
     else:
         for method in compared:
             if method.verdict is not None and method.verdict.level == "fail":
-                message = f"no method recommended: the model of {method.name} fails in calib identify, reason below"
+                message = (
+                    f"no method recommended: the model of {method.name} fails in calib identify for the reason below"
+                )
                 notes.append(Note(message))
                 break
     return list(dict.fromkeys(notes))
@@ -207,7 +217,13 @@ def _one_line(error: CalibError) -> str:
 
 
 def _settings(inputs: IdentificationInputs, method: Method, friction: str) -> IdentificationSettings:
-    """Return the identification settings for a method, without those settings that the method does not use."""
+    """Return the identification settings for a method, without those settings that the method does not use.
+
+    Args:
+        inputs: the recordings with the user's settings.
+        method: the method.
+        friction: friction model: ``standard``, ``auto``, or a step of the ladder.
+    """
     settings = replace(inputs.options.settings, method=method.name, essential="none", friction=friction)
     if not method.takes_constraints:
         settings = replace(settings, constraints=None)
@@ -275,7 +291,12 @@ def _errors(model: Identification, inputs: IdentificationInputs, same_unit: np.n
 
 
 def _sums(model: Identification, cases: Sequence[Case]) -> _Sums:
-    """Return the sums of a model's errors over each block of time of the recordings."""
+    """Return the sums of a model's errors over each block of time of the recordings.
+
+    Args:
+        model: the model.
+        cases: the recordings.
+    """
     errors = []
     sizes = []
     raw_errors = []
@@ -302,7 +323,12 @@ def _percent(error: np.ndarray, size: np.ndarray) -> float:
 
 
 def _leaving_out(sums: _Sums, same_unit: np.ndarray) -> np.ndarray:
-    """Return the relative error (k,) [%] with each of the k blocks of time left out in turn."""
+    """Return the relative error (k,) [%] with each of the k blocks of time left out in turn.
+
+    Args:
+        sums: sums of squared errors and torques over k blocks of time.
+        same_unit: (rows,) whether a torque row has the unit in which errors are summed.
+    """
     error = sums.error[:, same_unit].sum(axis=1)
     size = sums.size[:, same_unit].sum(axis=1)
     return 100.0 * np.sqrt((error.sum() - error) / np.maximum(size.sum() - size, 1e-300))
@@ -323,7 +349,12 @@ def _unseen_error(result: tuple[ComparedMethod, _Sums]) -> float:
 
 
 def _ranked(results: Sequence[tuple[ComparedMethod, _Sums]], same_unit: np.ndarray) -> list[ComparedMethod]:
-    """Return the methods by rank; the first fast one among the equally good methods is marked as recommended."""
+    """Return the methods by rank; the first fast one among the equally good methods is marked as recommended.
+
+    Args:
+        results: each method's result, and its sums of squared errors and torques over blocks of time.
+        same_unit: (rows,) whether a torque row has the unit in which errors are summed.
+    """
     if not results:
         return []
     order = sorted(results, key=_unseen_error)
@@ -365,7 +396,7 @@ HEADER = [
 
 
 def write_table(compared: Sequence[ComparedMethod], path: Path) -> Path:
-    """Write the comparison as CSV and return its path."""
+    """Write the results of the methods as CSV and return its path."""
     lines = []
     for method in compared:
         worst_joint, worst_error = method.worst
@@ -436,7 +467,12 @@ def line(method: ComparedMethod) -> str:
 
 
 def section(compared: Sequence[ComparedMethod], notes: Sequence[Note]) -> Section:
-    """Return the report section: table of methods, notes, and the verdict on the selected method's model."""
+    """Return the report section: table of methods, notes, and the verdict on the selected method's model.
+
+    Args:
+        compared: results of the methods, best first.
+        notes: notes on the ranking.
+    """
     blocks = [*_blocks(compared), Text("", notes, "note")]
     for method in compared:
         if method.verdict is not None:
@@ -445,7 +481,11 @@ def section(compared: Sequence[ComparedMethod], notes: Sequence[Note]) -> Sectio
 
 
 def _blocks(compared: Sequence[ComparedMethod]) -> Iterator[Block]:
-    """Yield the report blocks with the ranked table, and with the reasons for methods without an estimate."""
+    """Yield the report blocks with the ranked table, and with the reasons for methods without an estimate.
+
+    Args:
+        compared: results of the methods, best first.
+    """
     ranked = [method for method in compared if not method.failure]
     note = (
         "100 ‖τ - τ̂‖ / ‖τ‖ on unseen motion, in the identification band, ± its standard error over blocks of time; "

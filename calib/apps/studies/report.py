@@ -65,7 +65,12 @@ OURS = (ROWS, LOCK, SUMMARY, REPORT)
 
 
 def boxes(condition: ConditionSummary, rows: Sequence[TrialRow]) -> Picture:
-    """Return the box plot of a condition: torque errors of each method over its runs."""
+    """Return the box plot of a condition: torque errors of each method over its runs.
+
+    Args:
+        condition: summary of the condition.
+        rows: rows of the condition's trials.
+    """
     layers: list[Layer] = []
     all_errors: list[float] = []
     for height, method in enumerate(condition.methods):
@@ -271,7 +276,11 @@ def condition_table(summary: ConditionSummary, names: Sequence[str] = ON_CONSOLE
 
 
 def failures(summary: ConditionSummary) -> list[Text]:
-    """Return the failures of each method on a condition: kind, number, and first message; an empty list without any."""
+    """Return the failures of each method on a condition: kind, number, and first message; an empty list without any.
+
+    Args:
+        summary: summary of the condition.
+    """
     lines = []
     for method in sorted(summary.methods, key=attrgetter("method")):
         for status, count in method.failures.items():
@@ -319,7 +328,7 @@ def make_page(
     blocks: list[Block] = [overview(conditions)]
     if len(conditions) > 1:
         blocks.append(torque_table(conditions))
-    blocks += [Text("How that was decided", RULE), Text("Figures", MEANING)]
+    blocks += [Text("How methods are recommended", RULE), Text("Figures", MEANING)]
     sections = [Section("", blocks)]
     all_columns = [column.name for column in COLUMNS]
     for summary in conditions:
@@ -392,7 +401,7 @@ def run_study(
         studies: study files, names of shipped ones, or patterns of these names.
         out: the study's folder; trials whose rows it already contains are not run again.
         methods, runs: replace the methods and the number of runs in the files; None: as in the files.
-        where: where the tasks run, see `calib.workers.workers`.
+        where: number of local processes, or the address of a Dask scheduler; None: the tasks run in this process.
         report_only: run nothing and leave the rows unchanged; possible while another command adds rows.
         plots: whether the report has figures.
         say: called with messages on progress.
@@ -410,12 +419,12 @@ def run_study(
         rows = read_rows(out)
     else:
         with opened(out) as store:
-            say(f"{len(store.rows)} rows are there")
+            say(f"{len(store.rows)} rows exist")
             with workers(where) as crew:
                 progress = run(study, store, crew, lambda progress: say(str(progress)))
             say("writing")
             rows = list(store.rows.values())
-            stored = f"{ROWS} holds {len(rows)} rows"
+            stored = f"{ROWS} contains {len(rows)} rows"
     counted, notes = _counted(study, rows)
     if not progress.lost and not counted:
         contents = "no rows"
@@ -425,7 +434,7 @@ def run_study(
         advice = "ask for 1 run or more (--runs)"
         if report_only:
             advice = "run the study first, or name its folder (--out)"
-        raise UsageError(f"nothing to report: {out} holds {contents}; {advice}")
+        raise UsageError(f"nothing to report: {out} contains {contents}; {advice}")
     versions = sorted({row.toolkit for row in counted})
     if len(versions) > 1:
         notes.append(f"rows were made by several versions: {', '.join(versions)}")
@@ -439,7 +448,7 @@ def run_study(
 
 
 def _counted(study: Study, rows: Sequence[TrialRow]) -> tuple[list[TrialRow], list[str]]:
-    """Return the rows that are used for a study, and notes on those that are not."""
+    """Return the stored rows that are used for a study, and notes on the rows that are not used."""
     digests = {condition.digest for condition in study.conditions}
     study_rows = [row for row in rows if row.digest in digests]
     notes = []
@@ -454,7 +463,11 @@ def _counted(study: Study, rows: Sequence[TrialRow]) -> tuple[list[TrialRow], li
 
 
 def _check_folder(out: Path, studies: Sequence[str | Path]) -> None:
-    """Raise UsageError if the output folder is a file, or contains files with these names that no study wrote."""
+    """Raise UsageError if a study cannot be written into the folder `out`.
+
+    The folder must not be a file or contain one of the study files `studies`, rows of an old format, or a summary or
+    report that no study wrote.
+    """
     require(not out.is_file(), f"{out} is a file; give a folder for the study's rows (--out)", UsageError)
     files.check_not_input([out, *(out / name for name in OURS)], studies)
     check_format(out)

@@ -73,7 +73,7 @@ class Progress:
 
 
 def span(seconds: float) -> str:
-    """Return a duration as text, such as 40 s, 12 min, 3.1 h."""
+    """Return a duration `seconds` [s] as text, such as 40 s, 12 min, 3.1 h."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     if seconds < 5400:
@@ -85,6 +85,10 @@ def _missing(study: Study, store: RowStore) -> Iterator[Trials]:
     """Yield the tasks whose rows are missing in the store, data set by data set over all conditions.
 
     Methods without start values run once per data set, the others once for each start value.
+
+    Args:
+        study: the study.
+        store: the store of the study's rows.
     """
     data_sets = 0
     for runs in study.runs:

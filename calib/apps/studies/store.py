@@ -46,7 +46,7 @@ class RowStore:
 
     Attributes:
         folder: folder of the study.
-        rows: key to row.
+        rows: key (digest of the condition, method, seed) to row.
     """
 
     def __init__(self, folder: Path, database: sqlite3.Connection) -> None:
@@ -57,7 +57,11 @@ class RowStore:
         self.rows = {row.key: row for row in _read(database, folder / ROWS)}
 
     def holds(self, key: tuple[str, str, int]) -> bool:
-        """Return whether the store contains the trial with this key, by the method's current version."""
+        """Return whether the store contains a trial that was made with the method's current version.
+
+        Args:
+            key: digest of the condition, method, and seed of the trial.
+        """
         return key in self.rows and self.rows[key].current
 
     def append(self, rows: Sequence[TrialRow]) -> None:
@@ -130,7 +134,11 @@ def _other_format(path: Path, version: int) -> UsageError:
 
 
 def _connected(path: Path) -> sqlite3.Connection:
-    """Return a connection to a SQLite file that is new or of this version's format; raise UsageError for any other."""
+    """Return a connection to the SQLite file at `path`, which is new or of this version's format.
+
+    Raises:
+        UsageError: a file of another format, or a damaged one.
+    """
     with refused_as(UsageError, sqlite3.DatabaseError, f"{path} is damaged: {{}}; run the study in another folder"):
         database = sqlite3.connect(path)
         version = _format(database)

@@ -153,7 +153,12 @@ def summarise(study: Study, rows: Iterable[TrialRow]) -> list[ConditionSummary]:
 
 
 def _ranked(condition: Condition, rows: Mapping[str, Sequence[TrialRow]]) -> ConditionSummary:
-    """Return the summary of a condition, with ranked methods, from the rows of each method."""
+    """Return the summary of a condition, with ranked methods.
+
+    Args:
+        condition: the condition.
+        rows: name of a method to its rows on this condition.
+    """
     if not rows:
         return ConditionSummary(condition, ())
     summaries = []
@@ -206,7 +211,9 @@ def _pairs(errors: Mapping[int, float], reference: Mapping[int, float]) -> list[
 
 
 def _median_ratio(errors: Mapping[int, float], reference: Mapping[int, float]) -> float:
-    """Return the median ratio of two methods' errors on common data sets; infinite without common data sets.
+    """Return the median ratio (`errors` / `reference`) of two methods' errors on common data sets.
+
+    Infinite without common data sets.
 
     Args:
         errors, reference: seed of the data set to error, for the two methods.

@@ -35,6 +35,9 @@ MAX_MESSAGE = 300
 class TrialRow:
     """Figures of merit of one trial; NaN where a figure is not available.
 
+    β are the p base parameters, W is the observation matrix, τ the torques; a hat marks estimates. "The survey" is
+    Leboutet et al. (2021).
+
     Attributes:
         condition, digest: name of the condition, and the digest of its content.
         method, seed: method and seed of the trial.
@@ -45,12 +48,13 @@ class TrialRow:
         beta_error: 100 ‖β̂ - β‖ / ‖β‖ [%].
         beta_distance: the survey's d_β = 100 (2/p) Σ |β̂_j - β_j| / (|β̂_j| + |β_j|) [%].
         beta_sigma: rms of (β̂_j - β_j) / σ_j: 1 where the estimated σ match the errors.
-        coverage: share of the parameters within 1.96 σ [%].
+        coverage: share of the parameters whose true value is within 1.96 σ of the estimate [%].
         torque_error: 100 ‖τ̂ - τ‖ / ‖τ‖ along the validation motion, τ noise-free [%].
         torque_worst: torque error of the worst joint [%].
-        survey_tau: the survey's d_τ = 100 mean_k ‖τ_m - W β̂‖ / ‖τ_m‖ on the method's own data set, noise included [%].
-        survey_q: the survey's d_q = 100 mean_k ‖q - q_s‖ / ‖q‖, q_s simulated with β̂ [%]; only for the first data
-            sets.
+        survey_tau: the survey's d_τ = 100 mean_k ‖τ_m - W β̂‖ / ‖τ_m‖ on the method's own data set, with measured
+            torques τ_m, noise included [%].
+        survey_q: the survey's d_q = 100 mean_k ‖q - q_s‖ / ‖q‖, with positions q_s simulated with β̂ [%]; only for the
+            first data sets.
         iterations, simulations: number of iterations and simulations of the method.
         seconds, cpu: wall-clock and processor time of the method [s].
         version: version of the toolkit, followed by that of the method if it has changed: ``0.1.0``, ``0.1.0 method
@@ -201,7 +205,12 @@ def _percent(error: np.ndarray, size: np.ndarray) -> float:
 
 
 def _survey_tau(data: Experiment, values: np.ndarray) -> float:
-    """Return the survey's torque error d_τ [%] of base parameters (b,) on the data set's first recording."""
+    """Return the torque error d_τ of Leboutet et al. (2021) [%] of an estimate on the data set's first recording.
+
+    Args:
+        data: the data set.
+        values: (b,) estimated base parameters.
+    """
     problem = data.problem
     case = problem.cases[0]
     predicted = predict(Dynamics(problem.model, problem.base.to_standard(values)), case)
@@ -211,7 +220,7 @@ def _survey_tau(data: Experiment, values: np.ndarray) -> float:
 
 
 def _resimulated(condition: Condition, data: Experiment, values: np.ndarray, seed: int) -> float:
-    """Return the survey's position error d_q [%] of an estimate; NaN if unavailable.
+    """Return the position error d_q of Leboutet et al. (2021) [%] of an estimate; NaN if unavailable.
 
     The motion is simulated again without noise, with the estimated parameters.
 
@@ -262,7 +271,13 @@ def _version(method: str) -> str:
 
 
 def grouped(condition: Condition, methods: Sequence[str], seed: int) -> list[Trials]:
-    """Return the trials of one data set as tasks: one per simulating method, one for all other methods."""
+    """Return the trials of one data set as tasks: one per simulating method, one for all other methods.
+
+    Args:
+        condition: the condition.
+        methods: names of the methods.
+        seed: seed of the trials.
+    """
     fast = [name for name in methods if not method_named(name).needs_simulation]
     tasks = []
     if fast:

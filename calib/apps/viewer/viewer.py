@@ -77,9 +77,12 @@ def write(folder: str | Path, path: str | Path, robot: str | None = None) -> Sce
 
 
 def write_beside(folder: str | Path) -> str:
-    """Write ``session.rrd`` into a folder if possible, and return its name, or in one line why it failed; never raises.
+    """Write ``session.rrd`` into a folder, and return its name, or in one line why it failed; never raises.
 
     A recording is a convenience: neither a missing package nor a full disk stops the step that writes it.
+
+    Args:
+        folder: folder of a session.
     """
     try:
         write(folder, Path(folder) / FILE)
@@ -164,7 +167,11 @@ def _rms(values: np.ndarray) -> float:
 
 
 def _size_lines(sizes: ErrorSizes) -> Iterator[str]:
-    """Yield lines on the errors of measurements that do not give a position in the arm's base."""
+    """Yield lines on the errors of measurements that do not give a position in the arm's base.
+
+    Args:
+        sizes: magnitudes of these errors.
+    """
     for label, rows in (("fitted", ~sizes.unseen), ("unseen", sizes.unseen)):
         if not rows.any():
             continue
@@ -198,9 +205,13 @@ def _poses(name: str, count: int, start: float, selection: np.ndarray | None = N
 
 
 def _measured(recording: RecordingStream, scene: Scene, measured: Measured, start: float) -> float:
-    """Log measured points and error arrows, all together and pose by pose.
+    """Log measured points and error arrows, all together and pose by pose; return the start time of the next part [s].
 
-    Returns the start time of the next part [s].
+    Args:
+        recording: the recording.
+        scene: the scene, which contains the robot.
+        measured: the measured poses.
+        start: time at which this part begins [s].
     """
     if not len(measured.q) or scene.chain is None:
         return start
@@ -241,9 +252,13 @@ def _measured(recording: RecordingStream, scene: Scene, measured: Measured, star
 
 
 def _sizes(recording: RecordingStream, scene: Scene, sizes: ErrorSizes, start: float) -> float:
-    """Log the sizes of errors row by row, with the arm at each row's pose.
+    """Log the sizes of errors row by row, with the arm at each row's pose; return the start time of the next part [s].
 
-    Returns the start time of the next part [s].
+    Args:
+        recording: the recording.
+        scene: the scene, which contains the robot.
+        sizes: magnitudes of the errors.
+        start: time at which this part begins [s].
     """
     count = len(sizes.q)
     entity = f"errors/{sizes.kind}"
@@ -267,7 +282,16 @@ def _chosen(
 ) -> float:
     """Log a pose plan as it grows: one more tool position per step, and the arm at the newest pose.
 
-    Returns the start time of the next part [s].
+    Args:
+        recording: the recording.
+        scene: the scene.
+        chain: the robot.
+        name: name of the plan.
+        q: (m, n) joint values of the plan's poses [rad or m].
+        start: time at which this part begins [s].
+
+    Returns:
+        The start time of the next part [s].
     """
     tips = strips(chain, q)[0][:, -1]
     counts = np.arange(1, len(q) + 1)
@@ -282,7 +306,14 @@ def _chosen(
 
 
 def _played(recording: RecordingStream, scene: Scene, played: Played, start: float) -> float:
-    """Log a motion and its limits from time `start` [s] on; return the start time of the next part [s]."""
+    """Log a motion and its limits; return the start time of the next part [s].
+
+    Args:
+        recording: the recording.
+        scene: the scene, which contains the robot.
+        played: the motion.
+        start: time at which this part begins [s].
+    """
     t = start + played.t - played.t[0]
     samples = thinned(played.t)
     index = [rr.TimeColumn("time", duration=t[samples])]
@@ -300,7 +331,15 @@ def _played(recording: RecordingStream, scene: Scene, played: Played, start: flo
 
 
 def _limits(recording: RecordingStream, joint: Joint, name: str, ends: np.ndarray, velocities: bool) -> None:
-    """Log a joint's limits, if it has any, as lines from the first to the last time of a motion, `ends` (2,) [s]."""
+    """Log a joint's limits, if it has any, as lines over the duration of a motion.
+
+    Args:
+        recording: the recording.
+        joint: the joint.
+        name: its name in the viewer.
+        ends: (2,) first and last time of the motion [s].
+        velocities: whether the limits of velocity are logged, too.
+    """
     index = [rr.TimeColumn("time", duration=ends)]
     limits = [("position", "lower", joint.lower), ("position", "upper", joint.upper)]
     if velocities:
@@ -314,7 +353,14 @@ def _limits(recording: RecordingStream, joint: Joint, name: str, ends: np.ndarra
 def _torques(recording: RecordingStream, scene: Scene, torques: Torques, start: float) -> float:
     """Log measured torques, predicted torques and residuals, with the arm on the same time axis.
 
-    Returns the start time of the next part [s].
+    Args:
+        recording: the recording.
+        scene: the scene, which contains the robot.
+        torques: torques of one recording of the robot.
+        start: time at which this part begins [s].
+
+    Returns:
+        The start time of the next part [s].
     """
     t = start + torques.t - torques.t[0]
     index = [rr.TimeColumn("time", duration=t)]
@@ -363,7 +409,14 @@ def _series(
 
 
 def _arm(recording: RecordingStream, scene: Scene, index: list[TimeColumn], q: np.ndarray) -> None:
-    """Log the arm's links as lines, and the frames of the links if the robot has meshes, at joint values q (m, n)."""
+    """Log the arm's links as lines, and the frames of the links if the robot has meshes, at joint values q (m, n).
+
+    Args:
+        recording: the recording.
+        scene: the scene, which contains robot and meshes.
+        index: time columns of the m poses.
+        q: joint values [rad or m].
+    """
     if scene.chain is None or q.shape[1] != scene.chain.n:
         return
     lines = strips(scene.chain, q)
@@ -395,7 +448,7 @@ def _arm(recording: RecordingStream, scene: Scene, index: list[TimeColumn], q: n
 
 
 def _meshes(recording: RecordingStream, scene: Scene) -> None:
-    """Log each mesh once, attached to the frame of its link."""
+    """Log each mesh of a scene's robot once, attached to the frame of its link."""
     for number, mesh in enumerate(scene.meshes):
         entity = f"world/robot/links/{_part(mesh.link)}/mesh_{number}"
         position = mesh.placement[:3, 3]
@@ -405,7 +458,7 @@ def _meshes(recording: RecordingStream, scene: Scene) -> None:
 
 
 def _blueprint(scene: Scene) -> Any:
-    """Return the initial layout of the recording: the arm on the left, plots and text on the right."""
+    """Return the initial layout of the recording of a scene: the arm on the left, plots and text on the right."""
     import rerun.blueprint as rrb
 
     tabs: list[Any] = []

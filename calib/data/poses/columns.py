@@ -131,7 +131,7 @@ class Sheet:
             self.table.index(name)
         for name, unit in self.options.units.items():
             if name not in (*names, *UNIT_GROUPS, *self.table.header) and not _TARGET.fullmatch(name):
-                message = f"the options state unit {unit} for '{name}', which is not a column"
+                message = f"the options state unit {unit} for '{name}', which is not a column: correct [units]"
                 self.fail(message + suggestion(name, (*names, *UNIT_GROUPS)), name)
 
     def find_joints(self, joints: Sequence[str]) -> tuple[str, ...]:
@@ -234,7 +234,7 @@ class Sheet:
         if len(candidates) == 1:
             return candidates[0]
         if candidates:
-            fault = " and ".join(candidates) + " could be it"
+            fault = " and ".join(candidates) + " could be meant"
         else:
             fault = f"missing{suggestion(name, self.table.header)}"
         self.fail(f"{fault}: {', '.join(together)} belong together; map this one in [columns], too", name)
@@ -331,7 +331,9 @@ def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
     if not orientation:
         sheet.fail("kind 'pose' needs qx qy qz qw, r11 to r33, or rx ry rz; the header has none of them")
     if len(positions) > 1:
-        sheet.fail("kind 'pose' allows one target per row, but positions are numbered", positions[1][0])
+        sheet.fail(
+            "kind 'pose' allows one target per row, but positions are numbered: use kind 'position'", positions[1][0]
+        )
     if orientation[0] not in ("qx", "r11"):
         meaning = f" as {sheet.options.euler}" if len(orientation) == 3 else ""
         notes = (*notes, f"the orientation is read from {', '.join(orientation)}{meaning}")

@@ -72,7 +72,12 @@ class PoseMeasurements:
             value = getattr(self, name)
             if value is None:
                 continue
-            require(len(value) == m, f"{name} has {len(value)} rows, q has {m}", MeasurementError, self.file)
+            require(
+                len(value) == m,
+                f"{name} has {len(value)} rows, but q has {m}: one row per pose is needed",
+                MeasurementError,
+                self.file,
+            )
             object.__setattr__(self, name, frozen(value, int if name in _COUNTS else float))
 
     @staticmethod

@@ -63,7 +63,7 @@ def check_joints(q: np.ndarray, sheet: Sheet, columns: Sequence[str], robot: Joi
         row_of_worst = int(np.argmax(excess[:, j]))
         share = f"{int((excess[:, j] > 0.0).sum())} of {len(q)} rows"
         where = f"most in row {table.rows[row_of_worst]}, by {excess[row_of_worst, j]:.2g} {joint_unit(kinds[j])[0]}"
-        notes.append(f"{joints[j]} is outside its limits in {share}, {where}; kept")
+        notes.append(f"{joints[j]} is outside its limits in {share}, {where}; these rows are used")
     turning = [j for j in range(len(joints)) if not sliding[j]]
     in_degrees = turning and all(units[j] in ("deg", "°", "degrees") for j in turning)
     if in_degrees and np.abs(q[:, turning]).max() < BOUNDS.max_turn * DEG:

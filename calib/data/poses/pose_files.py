@@ -84,7 +84,10 @@ def read_groups(sheet: Sheet, layout: Layout, q: np.ndarray) -> GroupedMeasureme
     notes = ()
     single = [name for name, size in zip(names, np.bincount(group)) if size == 1]
     if single:
-        notes = (f"{layout.kind} {', '.join(single[:5])}: a group of one row determines nothing",)
+        notes = (
+            f"{layout.kind} {', '.join(single[:5])}: measured in one row only, which determines nothing; measure "
+            "more rows",
+        )
     common: FieldValues = {
         "group": group,
         "group_names": names,
@@ -386,7 +389,7 @@ def _position(sheet: Sheet, names: Sequence[str], gaps: bool) -> np.ndarray:
     position = sheet.numbers(names, POSITION, gaps)
     empty = np.isnan(position)
     partial = empty & ~empty.all(axis=1, keepdims=True)
-    message = f"is empty, others of {', '.join(names)} are not: leave all of them empty where a target was not seen"
+    message = f"is empty, unlike others of {', '.join(names)}: leave all of them empty where a target was not seen"
     refuse(sheet.table, partial, names, lambda row, k: message)
     return position
 
@@ -410,7 +413,12 @@ def _sigma(sheet: Sheet, layout: Layout, visible: np.ndarray) -> np.ndarray | No
         sigma = sheet.numbers(names, replace(SIGMA, positive=""), gaps=not is_seen.all())
         sigma = np.where(sigma < 0.0, sigma, np.maximum(sigma, options.floor))
         SIGMA.check(np.where(is_seen, sigma, np.nan), sheet.table, names)
-        refuse(sheet.table, np.isnan(sigma) & is_seen, names, lambda row, k: "is empty where a target was seen")
+        refuse(
+            sheet.table,
+            np.isnan(sigma) & is_seen,
+            names,
+            lambda row, k: "is empty where a target was seen: state σ for every row, or remove the column",
+        )
         stack.append(sigma)
     return np.stack(stack, axis=1)
 

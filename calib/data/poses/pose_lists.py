@@ -247,8 +247,10 @@ def _explain(
     worst = int(np.argmax(distance))
     joint = int(np.argmax(np.abs(q[worst] - plan[index[worst]])))
     count = int((distance <= max_difference).sum())
-    message = f"only {count} of {len(q)} rows are planned poses; the nearest one differs by {distance[worst]:.3g}"
-    advice = "is it the right plan? If other poses were measured on purpose, set plan = false under [poses]"
+    message = (
+        f"only {count} of {len(q)} rows are planned poses; the one nearest to this row differs by {distance[worst]:.3g}"
+    )
+    advice = "is this the right plan? If other poses were measured on purpose, set plan = false under [poses]"
     return MeasurementError(f"{message}: {advice} in session.toml", measured.file, int(rows[worst]), names[joint])
 
 

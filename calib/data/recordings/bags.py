@@ -49,7 +49,7 @@ def read_bag(path: Path, joints: Joints | None, options: RecordingOptions) -> Re
         require(parts[series].size, f"its joint states have no {quantity}", MeasurementError, path)
     notes = []
     if skipped:
-        notes.append(f"{skipped} messages without one of the joints are not used")
+        notes.append(f"{skipped} messages that lack a joint are not used")
     if not parts["header"].any():
         notes.append("message headers have no stamps; the logging times are used, which jitter more")
     return Recording(
@@ -169,14 +169,16 @@ def _stack(values: list[object], series: str, path: Path) -> np.ndarray:
     if len(missing) == len(values):
         return np.empty((0, 0))
     if missing:
-        refuse_data(path, f"this message has no {series}, other messages have", series, missing[0] + 1)
+        refuse_data(
+            path, f"this message has no {series}, unlike other messages: cut this part out", series, missing[0] + 1
+        )
     return np.array(values)
 
 
 def _refuse_joints(names: Sequence[str], message_names: Sequence[tuple[str, ...]], path: Path) -> None:
     require(message_names, "its topic of joint states has no messages", MeasurementError, path)
     bag_names = sorted(set().union(*message_names))
-    fault = "no message with all joints at once"
+    fault = "no message with all joints of the robot at once"
     missing = [name for name in names if name not in bag_names]
     if missing:
         fault = f"no joint '{missing[0]}'{suggestion(missing[0], bag_names)}"

@@ -68,7 +68,7 @@ def check_recording(recording: Recording, joints: Joints | None = None) -> Recor
         MeasurementError: too few samples, values that are not finite, time stamps that do not increase, degrees instead
             of radians, or a torque that is constant while its joint moves.
     """
-    few = f"{len(recording)} samples are too few for filters; at least {LIMITS.min_samples} are needed"
+    few = f"{len(recording)} samples are too few for filters; record {LIMITS.min_samples} or more"
     require(len(recording) >= LIMITS.min_samples, few, MeasurementError, recording.file)
     recording = _without_absent(recording)
     _check_finite(recording)
@@ -110,7 +110,7 @@ def _without_absent(recording: Recording) -> Recording:
     for name, quantity in quantities:
         if absent[name]:
             joints = ", ".join(recording.joint_names[j] for j in absent[name])
-            notes.append(f"{quantity} of {joints} are NaN in every row: not provided, and not used for any joint")
+            notes.append(f"{quantity} of {joints} are NaN in every row, so they are not used for any joint")
     removed = dict.fromkeys(name for name, joints in absent.items() if joints)
     return _noted(replace(recording, **removed), *notes)
 
@@ -388,7 +388,7 @@ def _still(recording: Recording) -> list[str]:
     notes = []
     for j in np.flatnonzero(stands):
         fixed = np.ptp(recording.q[:, j]) < BOUNDS.min_travel
-        travel = "is one number" if fixed else f"moves less than {LIMITS.min_travel:g}"
+        travel = "is constant" if fixed else f"moves less than {LIMITS.min_travel:g}"
         effort = f", and so is its {recording.kind}" if dead[j] else ""
         notes.append(
             f"{recording.joint_names[j]} never moves (its position {travel}{effort}): parameters that only its "

@@ -238,7 +238,10 @@ def earlier(recording: Recording, lag: float) -> Recording:
     if len(t):
         covered = (t >= recording.t[0]) & (t <= recording.t[-1])
     if not covered.any():
-        refuse_data(recording.file, f"a lag of {lag:g} s leaves no sample of a recording of {recording.duration:.3g} s")
+        refuse_data(
+            recording.file,
+            f"a lag of {lag:g} s leaves no sample of a recording of {recording.duration:.3g} s: is it in s?",
+        )
     shifted: dict[str, object] = {}
     for name in LATE:
         values = getattr(recording, name)

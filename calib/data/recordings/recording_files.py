@@ -53,7 +53,9 @@ def read_log(path: Path, joints: Joints | None, options: RecordingOptions, ends:
     for name, columns in columns_of.items():
         if name != "t" and len(columns) != n:
             headings = ", ".join(_headings(table, columns))
-            refuse_data(path, f"{len(columns)} columns of {name} ({headings}) for {n} of q")
+            refuse_data(
+                path, f"has {len(columns)} columns of {name} ({headings}), but {n} of q: one per joint is needed"
+            )
         check_units(name, [table.units[column] for column in columns], joints, path)
 
     t = _stamps(table, columns_of, options)
@@ -328,5 +330,5 @@ def _reader(path: Path, ends: Ends) -> Reader:
         fault = "is neither a NumPy archive, a bag nor text" if head else "is empty"
         refuse_data(path, f"{fault}: expected .npz, .csv, .mcap, .bag or a ROS 2 bag's folder")
     if len(head) == 1 << 16 and b"\n" not in head:
-        refuse_data(path, "has a first line of more than 64 kB: not a table")
+        refuse_data(path, "has a first line of more than 64 kB: it is not a table; was it saved as CSV?")
     return partial(read_log, ends=ends)

@@ -327,7 +327,7 @@ def joint_order(names: list[str], joints: Joints | None, n: int, path: str | Pat
         path: the file, for messages.
     """
     if names and len(names) != n:
-        refuse_data(path, f"joint_names has {len(names)} names for {n} columns")
+        refuse_data(path, f"joint_names has {len(names)} names for {n} columns: state one per column")
     if joints is None or not names:
         column_names: Sequence[str] = names
         if joints is not None and len(joints.names) == n:

@@ -31,7 +31,7 @@ def in_order(recording: Recording) -> Recording:
         return recording
     order = np.concatenate([part.start + np.argsort(t[part], kind="stable") for part in parts])
     count = int((back > 0.0).sum())
-    remark = f"{count} stamps are up to {1e3 * back.max():.3g} ms earlier than one before them"
+    remark = f"{count} stamps are up to {1e3 * back.max():.3g} ms earlier than stamps before them"
     if _path_length(recording.q[order]) < _path_length(recording.q):
         ordered = recording.take(order)
         note = f"{remark}: the rows are sorted by their stamps"

@@ -105,7 +105,9 @@ def propose_cutoffs(sampled: Resampled, dynamics: float | None = None) -> Cutoff
     position, position_reason = _position_cutoff(f, power, floor, active, dynamics, sampled.rate)
     factor = factor_for(sampled.rate, min(2 * dynamics, USABLE * sampled.rate / 2))
     band = USABLE * sampled.rate / (2 * factor)
-    band_reason = f"f_p = {band:.3g} Hz (2 f_dyn, rounded to a whole decimation factor n_d = {factor})"
+    band_reason = (
+        f"identification band f_p = {band:.3g} Hz (2 f_dyn, rounded to a whole decimation factor n_d = {factor})"
+    )
     noise = np.sqrt(floor * sampled.rate / 2)
     reasons = (dynamics_reason, *peak_notes, position_reason, band_reason)
     return Cutoffs(dynamics, position, band, factor, frozen(noise), reasons)
@@ -153,12 +155,12 @@ def _position_cutoff(
     highest = USABLE * rate / 2
     if highest <= min(5 * dynamics, quiet):
         reason = f"{USABLE:g} of the Nyquist frequency; 5 f_dyn would be {5 * dynamics:.3g} Hz"
-        return highest, f"f_q = {highest:.3g} Hz, {reason}"
+        return highest, f"cut-off of positions f_q = {highest:.3g} Hz, {reason}"
     if quiet >= 5 * dynamics:
-        return 5 * dynamics, f"f_q = {5 * dynamics:.3g} Hz (5 f_dyn)"
+        return 5 * dynamics, f"cut-off of positions f_q = {5 * dynamics:.3g} Hz (5 f_dyn)"
     lower = min(max(quiet, 2 * dynamics), highest)
     reason = f"at 5 f_dyn = {5 * dynamics:.3g} Hz noise exceeds 5 % of the acceleration"
-    return lower, f"f_q = {lower:.3g} Hz: {reason}"
+    return lower, f"cut-off of positions f_q = {lower:.3g} Hz: {reason}"
 
 
 def _active(steps: np.ndarray) -> np.ndarray:
@@ -179,7 +181,7 @@ def _choose(per_joint: np.ndarray, dynamics: float | None) -> tuple[float, str]:
         dynamics: f_dyn that the options state, which is then returned; None: none.
     """
     if dynamics is not None:
-        return dynamics, f"f_dyn = {dynamics:.3g} Hz as stated"
+        return dynamics, f"bandwidth of the motion f_dyn = {dynamics:.3g} Hz, as stated"
     fastest = int(np.argmax(per_joint))
     top = float(per_joint[fastest])
     middle = 0.0
@@ -188,14 +190,17 @@ def _choose(per_joint: np.ndarray, dynamics: float | None) -> tuple[float, str]:
     frequency = min(top, MAX_SPREAD * middle)
     if frequency < LOWEST:
         extent = f"ends at {frequency:.2g} Hz" if frequency else "hardly exceeds the noise"
-        return LOWEST, f"f_dyn = {LOWEST:g} Hz: the motion {extent}; friction is faster"
+        return LOWEST, f"bandwidth f_dyn = {LOWEST:g} Hz: the motion {extent}, but friction is faster"
     if frequency > MAX_CUTOFF:
-        reason = f"joint {fastest + 1} moves at {top:.3g} Hz, where no robot is rigid"
-        return MAX_CUTOFF, f"f_dyn = {MAX_CUTOFF:g} Hz: {reason}"
+        reason = f"joint {fastest + 1} moves at {top:.3g} Hz, at which no robot is rigid"
+        return MAX_CUTOFF, f"bandwidth of the motion f_dyn = {MAX_CUTOFF:g} Hz: {reason}"
     if frequency < top:
         reason = f"{MAX_SPREAD:g} times the median: joint {fastest + 1}'s {top:.3g} Hz is an outlier"
-        return frequency, f"f_dyn = {frequency:.3g} Hz, {reason}"
-    return frequency, f"f_dyn = {frequency:.3g} Hz: 95 % of the acceleration power of joint {fastest + 1} lies below"
+        return frequency, f"bandwidth of the motion f_dyn = {frequency:.3g} Hz, {reason}"
+    return (
+        frequency,
+        f"bandwidth f_dyn = {frequency:.3g} Hz: 95 % of the acceleration power of joint {fastest + 1} is below it",
+    )
 
 
 def _joint_dynamics(f: np.ndarray, power: np.ndarray, floor: float) -> tuple[float, float]:

@@ -304,7 +304,9 @@ def with_reference(motion: Motion, path: Path, joints: Joints, options: Recordin
     else:
         t, q = read_positions(path, joints, options)
     if q.shape[1:] != (motion.n,):
-        refuse_data(path, f"has {q.shape[1]} joints, the recording has {motion.n}")
+        refuse_data(
+            path, f"has {q.shape[1]} joints, the recording has {motion.n}: is it the reference of this recording?"
+        )
     if len(t) < MIN_REFERENCE_SAMPLES or not np.isfinite(q).all() or not (np.diff(t) > 0.0).all():
         refuse_data(path, "a reference needs ten samples or more, finite numbers and increasing stamps")
     slack = 1.5 * float(np.median(np.diff(t)))
@@ -451,7 +453,7 @@ def _reasons(cutoffs: Cutoffs, options: FilterOptions) -> tuple[str, ...]:
     for name, option in (("cutoff", options.cutoff), ("band", options.band)):
         if option is not None:
             frequencies = " ".join(f"{frequency:.4g}" for frequency in np.atleast_1d(option))
-            lines.append(f"{name} = {frequencies} Hz, stated, or that of the training motion")
+            lines.append(f"{name} = {frequencies} Hz, as stated or as for the training motion")
     # Both are stated: none was chosen from the data.
     if len(lines) == 2:
         return tuple(lines)

@@ -71,7 +71,10 @@ def report_excitation(motion: Motion) -> ExcitationReport:
     if len(moving) and one_frequency:
         low, high = frequency.min(), frequency.max()
         hertz = f"{low:.3g} Hz" if high - low < FREQUENCY_SPREAD * high else f"{low:.3g} to {high:.3g} Hz"
-        notes.append(f"each joint moves at one frequency ({hertz}): inertia, gravity and stiffness are inseparable")
+        notes.append(
+            f"each joint moves at one frequency ({hertz}): inertia, gravity and stiffness are not identifiable "
+            "separately"
+        )
     correlation = normalised.T @ normalised
     pairs = []
     for i, j in combinations(moving, 2):

@@ -108,7 +108,9 @@ def find_clock(recording: Recording, kind: str = "auto") -> SampleClock:
         dates, keep, period, step_ratio = counted
         clocks["counted"] = (dates, keep, period)
     if kind != "auto" and kind not in clocks:
-        raise UsageError(f"clock '{kind}': cannot date the samples of {recording.file or 'this recording'}")
+        raise UsageError(
+            f"clock '{kind}': cannot date the samples of {recording.file or 'this recording'}; use clock = 'auto'"
+        )
     roughness = {name: _roughness(recording.q, *clock) for name, clock in clocks.items()}
     roughness_of_stamps = max(roughness["stamps"], 1e-300)
     relative = {name: value / roughness_of_stamps for name, value in roughness.items()}
@@ -299,7 +301,9 @@ class SamplingReport:
         kind, times = self.clock.kind, self.clock.times
         if kind != "stamps":
             share = self.clock.roughness[kind]
-            lines.append(f"samples are dated by the clock '{kind}': positions are {1 / share:.3g} times smoother")
+            lines.append(
+                f"samples are dated by clock '{kind}': positions are {1 / share:.3g} times smoother than by stamps"
+            )
         if kind == "counted" and abs(times - 1.0) > APART:
             lines.append(f"step from measured velocities / step from stamps: {times:.4g}")
         if self.repeated:
@@ -367,7 +371,7 @@ def resample(recording: Recording, clock: str = "auto", gap: float = GAP, rate: 
         else:
             dropped.append((float(t[start]), float(duration)))
     if not segments:
-        message = f"has gaps: none of its {len(spans)} parts is longer than {MIN_SAMPLES} samples"
+        message = f"has gaps: none of its {len(spans)} parts is longer than {MIN_SAMPLES} samples; record without gaps"
         refuse_data(recording.file, message)
 
     grids: list[np.ndarray] = []

@@ -306,7 +306,8 @@ def identify_instrumental(
     change_percent = 100 * rounds[-1].change
     message = (
         f"instruments from simulation: parameters still change by {change_percent:.3g} % after {limit} "
-        f"iterations; estimate fewer (essential ones), or check the controller's gains{_if_weak(task, estimate, std)}"
+        "iterations; estimate fewer parameters (essential ones), or check the controller's "
+        f"gains{_if_weak(task, estimate, std)}"
     )
     if len(rounds) > 2 and rounds[-1].change > rounds[1].change:
         raise Diverged(message, before)

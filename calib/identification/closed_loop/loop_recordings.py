@@ -95,7 +95,7 @@ def close_loops(
             if usable.stop - usable.start > 2 * len(decimator.taps):
                 stretches.append(part)
     if not stretches:
-        refuse_data(cases[0].motion.file, "no part without gaps is long enough to be simulated")
+        refuse_data(cases[0].motion.file, "no part without gaps is long enough to be simulated: record longer")
     ordered = sorted(stretches, key=lambda part: -len(part.motion))
     controller, identified, notes = _controller(loop, ordered[0])
     shifts: dict[str, float] = {}
@@ -148,7 +148,9 @@ def _check_reference(motion: Motion) -> None:
     if not finite.all():
         joint = int(np.argmin(finite))
         refuse_data(
-            motion.file, f"the reference of {motion.joint_names[joint]} (joint {joint + 1}) is not finite everywhere"
+            motion.file,
+            f"the reference of {motion.joint_names[joint]} (joint {joint + 1}) is not finite everywhere: cut those "
+            "samples out",
         )
     for j in np.flatnonzero(np.ptp(motion.q, axis=0) > 1e-3):
         reference = motion.q_ref[:, j]
@@ -216,9 +218,9 @@ def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., LoopContro
     if motor_torques(part) is None:
         if estimated:
             raise UsageError(
-                f"{part.name}: no motor torques (rows = '{part.torque_rows.name}') tell when its reference was played; "
-                "use rows = 'both', or log the reference (q_ref); for iv alone [loop] timing = 'stated' will do, which "
-                "leaves it at the measured positions"
+                f"{part.name}: the time of its reference is estimated from motor torques, which rows = "
+                f"'{part.torque_rows.name}' do not have; use rows = 'both', or log the reference (q_ref); for method "
+                "iv alone, [loop] timing = 'stated' suffices: the reference stays where it matches the positions"
             )
         return 0.0, ()
     reference, every = _make_reference(motion, loop.rate)
@@ -240,10 +242,10 @@ def _shift(part: Case, loop: LoopSettings, fed_forward: Callable[..., LoopContro
     significant = abs(shift.seconds) > max(5.0 * shift.sigma, min_shift)
     if significant and shift.left < max_left and shift.before > min_gain * shift.left:
         message = (
-            f"its reference (q_ref) is {'late' if shift.seconds < 0.0 else 'early'} by {text}: so "
-            f"moved, the controller of [loop] explains {100 * (1 - shift.left):.3g} % of the torques, as logged "
-            f"{100 * (1 - min(shift.before, 1.0)):.2g} %. Set [loop] timing = 'estimated' to move it; or correct kd "
-            "and share, which may look like this; timing = 'stated' takes it as it is"
+            f"its reference (q_ref) is {'late' if shift.seconds < 0.0 else 'early'} by {text}: "
+            f"shifted by this, the controller of [loop] explains {100 * (1 - shift.left):.3g} % of the torques, "
+            f"as logged {100 * (1 - min(shift.before, 1.0)):.2g} %. Set [loop] timing = 'estimated' to shift it; or "
+            "correct kd and share, which may have the same effect; timing = 'stated' uses the logged times"
         )
         refuse_data(motion.file, message)
     return 0.0, ()

@@ -166,7 +166,7 @@ DIDIM = _Simulated(
     f"the simulated robot moves like the real one: stated controller, reference and {CHOSEN}; measured positions are "
     "not used",
     "didim",
-    description="least squares on the simulated motion alone (the slides' CLIE)",
+    description="least squares on the simulated motion alone (CLIE of the source)",
     source="Gautier, Janot & Vandanjon 2013",
 )
 PC_IV = replace(
@@ -427,7 +427,7 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
     distance = identification.apart
     if distance.any():
         notes += (
-            f"with the instruments of unbound parameters alone (Janot's slides) the estimate is at most "
+            f"with the instruments of unbound parameters alone (Janot's form) the estimate is at most "
             f"{distance.max():.2g} σ away, at {identification.names[int(np.argmax(distance))]}",
         )
     rounds = len(identification.rounds)

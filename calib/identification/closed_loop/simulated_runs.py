@@ -96,7 +96,7 @@ def nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tupl
             return candidate, simulated_runs(candidate, cases)
         except CalibError as error:
             problem = error
-    raise CannotSimulate(f"no robot on the way to the estimate can be simulated: {problem}", start)
+    raise CannotSimulate(f"no parameters between the start and the estimate can be simulated: {problem}", start)
 
 
 def distance_percent(runs: Runs) -> np.ndarray:

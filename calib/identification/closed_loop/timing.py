@@ -242,9 +242,9 @@ def check_no_copy(motion: Motion, reference_q: np.ndarray) -> None:
         note = f", {1e3 * -shift:.4g} ms later" if abs(shift) > 1e-5 else ""
         refuse_data(
             motion.file,
-            f"its reference (q_ref) is the measured positions{note}: instruments from it hold the noise that they are "
-            "to avoid. Log what was commanded (UR: target_q, Franka: q_d), or give the folder of the designed motion "
-            "(--excitation)",
+            f"its reference (q_ref) is the measured positions{note}: instruments from it contain the noise that they "
+            "are to avoid. Log what was commanded (UR: target_q, Franka: q_d), or give the folder of the designed "
+            "motion (--excitation)",
         )
 
 

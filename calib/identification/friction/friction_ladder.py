@@ -211,7 +211,7 @@ def select_friction(
             accepted, accepted_error, at = bench.test(selected, columns, error)
             note = ""
             if not columns:
-                note = "no joint shows a need for such terms in its residual: none tried"
+                note = "the residual of no joint shows a need for such terms: none tried"
             elif not at:
                 note = "no improvement on held-out time: not used"
             if accepted:

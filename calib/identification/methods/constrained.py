@@ -165,7 +165,7 @@ def within(
     upper = np.asarray(upper, dtype=float)
     has_length = lower.shape == (len(matrix),) == upper.shape
     sound = has_length and not np.isnan([lower, upper]).any()
-    require(sound, f"bounds: expected {len(matrix)} lower and upper ones, none of them NaN")
+    require(sound, f"bounds: expected {len(matrix)} lower and as many upper values, none of them NaN")
     if (lower > upper).any():
         worst = int(np.argmax(lower - upper))
         raise CalibError(f"bounds: lower {lower[worst]:g} is above upper {upper[worst]:g} in row {worst}")
@@ -224,12 +224,15 @@ class _Planes:
         if not len(scaled):
             return
         acts = scaled.any(axis=1)
-        require(acts.all(), f"equality {int(np.argmin(acts)) + 1} has only zero coefficients")
+        require(acts.all(), f"equality {int(np.argmin(acts)) + 1} has only zero coefficients; remove it")
         origin, _, rank, _ = np.linalg.lstsq(scaled, edges, rcond=1e-10)
         largest = max(float(np.abs(origin).max()), 1e-300)
         away = np.abs(scaled @ origin - edges) / np.maximum(np.abs(edges), largest)
-        require(away.max() <= max_contradiction, "equalities contradict each other: no point satisfies all of them")
-        require(rank < len(self.free), f"equalities fix all {rank} parameters: nothing remains to be estimated")
+        require(
+            away.max() <= max_contradiction,
+            "equalities contradict each other: no point satisfies all of them; remove one",
+        )
+        require(rank < len(self.free), f"equalities fix all {rank} parameters, so that none is estimated; remove some")
 
     def optimum(self, active: np.ndarray) -> Constrained:
         """Return the optimum under all equalities and the inequalities marked in `active` (c,), taken as equalities."""

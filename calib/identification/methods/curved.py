@@ -76,7 +76,9 @@ class Curved:
         except ArithmeticError:
             slope = np.full(len(u), np.nan)
         if not np.isfinite([self.value(b), *slope]).all():
-            self._refuse(f"no finite value or derivative at {self._at(u)}; state it so that it has one there")
+            self._refuse(
+                f"no finite value or derivative at {self._at(u)}; restate the constraint so that it has one there"
+            )
         if self.stated:
             self._compare(u, slope)
         return np.asarray(slope @ self.rows)
@@ -146,7 +148,7 @@ def make_curved(constraint: CurvedConstraint, row: Callable[[Mapping[str, float]
     name = constraint.name or (f"h({', '.join(names)}) >= 0" if callable(h) else h)
     location = f"[constraints] curved '{name}'"
     if callable(h) == (constraint.slope is None):
-        refuse_option(location, "'slope' states the derivatives of a function; a formula has its own")
+        refuse_option(location, "a function needs 'slope' (its derivatives), a formula has none: add or remove it")
     if callable(h) and constraint.slope is not None:
         function = _called(h, location, 1)
         count = len(names)
@@ -214,7 +216,7 @@ def _parsed(text: str, location: str) -> tuple[ast.expr, tuple[str, ...]]:
         allowed = f"parameters' names, numbers, + - * / **, {' '.join(_KNOWN)}, and one >= or <="
         refuse_option(location, f"expected {allowed}; found '{wrong}'")
     if not names:
-        refuse_option(location, "names no parameter")
+        refuse_option(location, "contains no parameter: state at least one")
     return tree, names
 
 
@@ -291,7 +293,7 @@ def tangents(
         if not satisfied:
             price = min(10.0 * price, MAX_PRICE)
     heights_text = "; ".join(f"h of '{constraint.name}' = {constraint.value(b):.3g}" for constraint in curved)
-    raise NotConverged(f"the nearest found has {heights_text}", b)
+    raise NotConverged(f"the nearest estimate has {heights_text}", b)
 
 
 def _share(merit: Callable[[np.ndarray], float], b: np.ndarray, step: np.ndarray) -> float:

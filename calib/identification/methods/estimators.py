@@ -54,14 +54,19 @@ def tls(
     factor = combine(data, std)
     direction, singular = _null_direction(factor, noise, count, data.names)
     if abs(direction[p]) <= 1e-10 * np.abs(direction).max():
-        raise Unidentifiable("no combination of the columns explains y: the columns depend on each other", data.names)
+        raise Unidentifiable(
+            "no combination of the columns explains y: the columns depend on each other; choose base columns",
+            data.names,
+        )
     values = -direction[:p] / direction[p]
     if count > p:
         variance = singular**2 / (count - p)
     else:
         variance = np.nan
     if not np.isfinite(variance):
-        raise Unidentifiable(f"{count} rows for {p} parameters: no residual is left to check them", data.names)
+        raise Unidentifiable(
+            f"{count} rows for {p} parameters: no residual is left to check them; record longer", data.names
+        )
     prior_rows = np.zeros((0, p))
     independent = count
     if inflation is not None:
@@ -109,7 +114,10 @@ def _null_direction(
     direction[noisy] = vt[-1] / noise[noisy]
     if k:
         if np.abs(np.diag(upper)[:k]).min() <= 1e-12 * np.abs(upper).max():
-            raise Unidentifiable("the exact columns are dependent", [names[c] for c in exact if c < len(names)])
+            raise Unidentifiable(
+                "the columns without noise are linearly dependent; choose base columns",
+                [names[c] for c in exact if c < len(names)],
+            )
         coupled = upper[:k, k:] @ direction[noisy]
         direction[exact] = -scipy.linalg.solve_triangular(upper[:k, :k], coupled)
     return direction, float(values[-1])

@@ -113,11 +113,11 @@ class Constraints(Frozen):
             return self._flattened(factor).touched(factor)
         if self.cone is None:
             return self
-        with _unsatisfied(f"no bodies that can exist satisfy {self}: remove bounds"):
+        with _unsatisfied(f"no physically consistent bodies satisfy {self}: remove bounds"):
             plane = self.cone.touching(factor, self.matrix, self.lower, self.upper)
         if plane is None:
             return replace(self, cone=None)
-        label = f"bodies that can exist ({', '.join(plane.bodies) or 'all'} on the border)"
+        label = f"physically consistent bodies ({', '.join(plane.bodies) or 'all'} on the border)"
         names = (*self.names, label)
         matrix = np.vstack([self.matrix, plane.normal])
         lower = np.append(self.lower, plane.bound)
@@ -146,7 +146,7 @@ class Constraints(Frozen):
             return further.solve(triangle, free)
 
         names = tuple(constraint.name for constraint in self.curved)
-        with _unsatisfied(f"no estimate satisfies {'; '.join(names)} beside {linear}: remove one of them"):
+        with _unsatisfied(f"no estimate satisfies {'; '.join(names)} together with {linear}: remove one of them"):
             normals, bounds = tangents(self.curved, factor, start, solve)
         all_names = (*self.names, *names)
         matrix = np.vstack([self.matrix, normals])
@@ -191,7 +191,7 @@ def make_constraints(
         low, high = weighted_sum.limits
         label = weighted_sum.name or " + ".join(f"{weight:g} {name}" for name, weight in weighted_sum.weights.items())
         twice = weighted_sum.equal is not None and (weighted_sum.least, weighted_sum.most) != (None, None)
-        require(not twice, f"{location}: 'equal' excludes 'least' and 'most'", UsageError)
+        require(not twice, f"{location}: 'equal' cannot be combined with 'least' or 'most': remove one", UsageError)
         if low > high or not (np.isfinite(low) or np.isfinite(high)):
             refuse_option(f"{location} ({label})", "expected equal, or least <= most")
         requests.append((label, weighted_sum.weights, low, high))
@@ -365,7 +365,9 @@ def _row(weights: Mapping[str, float], base: Base, names: Sequence[str]) -> np.n
     if np.abs(base.transform.T @ base_row - standard).max() > 1e-6 * max(np.abs(standard).max(), 1e-300):
         refuse_option("[constraints]", _without_effect(weights, base))
     row[: base.b] += base_row
-    require(row.any(), f"[constraints]: the weights of {', '.join(weights)} sum to zero", UsageError)
+    require(
+        row.any(), f"[constraints]: the weights of {', '.join(weights)} sum to zero; state other weights", UsageError
+    )
     return row
 
 

@@ -239,7 +239,7 @@ def irls(data: Samples, inflation: float = 1.0, solve: Callable[[np.ndarray], np
             values = solve(factor)
         if np.sum((factor[:-1, :-1] @ (values - last)) ** 2) <= 1e-8 * len(values):
             return _pack(data, values, covariance, size, weights, factor, inflation)
-    raise NotConverged("the weights of the samples do not converge", values)
+    raise NotConverged(f"the weights of the samples have not converged after {ROUNDS} rounds; use method wls", values)
 
 
 def row_irls(data: Samples) -> LinearFit:
@@ -262,7 +262,7 @@ def row_irls(data: Samples) -> LinearFit:
         values = fit.estimate.values
         if np.all(np.abs(step) <= 1e-3 * fit.estimate.sigma):
             return LinearFit(fit.estimate, std, fit.condition, fit.condition_normalised)
-    raise NotConverged("the weights of the rows do not converge", values)
+    raise NotConverged(f"the weights of the rows have not converged after {ROUNDS} rounds; use method wls", values)
 
 
 def _pack(

@@ -75,7 +75,9 @@ def find_prior_bodies(chain: Chain, model: IdentificationModel) -> Iterator[Prio
         yield _cad(chain, model, is_payload)
         return
     for total in TOTALS:
-        source = f"rods between the joints (the description has no masses), {total:.3g} kg in all by evidence"
+        source = (
+            f"rods between the joints (the description has no masses), of the most probable total mass, {total:.3g} kg"
+        )
         yield PriorBodies(rods(chain, model, total), ~is_payload, False, source)
 
 

@@ -139,7 +139,7 @@ def read(folder: str | Path, model: tuple[Chain, Dynamics] | None = None) -> Inf
     with refused_as(
         RobotError,
         (OSError, KeyError, ValueError),
-        f"{folder}: estimate.csv, covariance.csv and dynamics.json do not agree: {{}}",
+        f"{folder}: estimate.csv, covariance.csv and dynamics.json do not agree: {{}}; identify again",
     ):
         parameters = read_estimate(folder)
         names = tuple(parameter.name for parameter in parameters)

@@ -402,7 +402,9 @@ def _solved(curvature: np.ndarray, target: np.ndarray) -> np.ndarray:
             root = scipy.linalg.cho_factor(normalised + ridge * np.eye(len(unit)))
             break
     else:
-        raise NotConverged("the consistent parameters cannot be distinguished to within rounding")
+        raise NotConverged(
+            "the consistent parameters cannot be distinguished to within rounding: record a richer motion"
+        )
     scale = unit if target.ndim == 1 else unit[:, None]
     return scipy.linalg.cho_solve(root, target / scale) / scale
 

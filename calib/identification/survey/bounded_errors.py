@@ -182,7 +182,7 @@ GTLS = _GeneralisedTLS(
 SET_MEMBERSHIP = _SetMembership(
     "set-membership",
     "no torque error is larger than the largest residual of wls; q, v and a are exact",
-    description="centres of the intervals that a bound on the errors leaves",
+    description="centres of the parameter intervals that agree with a bound on the torque errors",
     source="Milanese & Belforte 1982; Ramdani & Poignet 2005",
     tunes=("bound of the errors", f"{ROUNDS} rounds of linear programs"),
 )

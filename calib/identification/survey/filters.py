@@ -84,7 +84,8 @@ class _KalmanFilter(Method):
         max_innovation = 30.0
         if not np.isfinite(innovation) or innovation > max_innovation:
             raise Diverged(
-                f"{self.name} diverged: its innovations are {np.sqrt(innovation):.3g} times the predicted ones",
+                f"{self.name} diverged: its innovations are {np.sqrt(innovation):.3g} times the predicted ones; use "
+                "another method",
                 state.mean,
             )
         covariance = max(1.0, innovation) * state.covariance
@@ -219,7 +220,12 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
     for q, tau in _steps(case, part):
         belief = full.step(belief, np.ascontiguousarray(tau), period / len(tau), torque)
         belief, size = corrected(belief, q, n, position_noise)
-        require(np.isfinite(size), "the filter's estimate is no longer finite", Diverged, belief.mean)
+        require(
+            np.isfinite(size),
+            "the filter diverged: its estimate is not finite; use another method",
+            Diverged,
+            belief.mean,
+        )
         sizes.append(size / n)
     settled = sizes[len(sizes) // 4 :]
     mean = belief.mean[2 * n :]

@@ -70,7 +70,9 @@ class Belief:
         try:
             return np.linalg.cholesky(self.spread)
         except np.linalg.LinAlgError as error:
-            raise Diverged("the filter's covariance is no longer positive definite", self.mean) from error
+            raise Diverged(
+                "the filter diverged: its covariance is not positive definite; use another method", self.mean
+            ) from error
 
 
 def believe(mean: np.ndarray, sigma: np.ndarray, kind: Filter) -> Belief:

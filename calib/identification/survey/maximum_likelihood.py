@@ -74,12 +74,16 @@ class _MaximumLikelihood(Method):
             steps.append(float(np.max(relative_steps)))
             values = iteration.values
             if not np.all(np.isfinite(values)) or (count > 5 and steps[-1] > 10.0 * steps[0]):
-                raise Diverged("maximum likelihood diverged: too much position noise for a linear model", values)
+                raise Diverged(
+                    "maximum likelihood diverged: too much position noise for a linear model; use another method",
+                    values,
+                )
             if steps[-1] < tolerance:
                 break
         else:
             raise NotConverged(
-                f"maximum likelihood still changes by {steps[-1]:.2g} standard deviations after {max_steps} rounds",
+                f"maximum likelihood still changes by {steps[-1]:.2g} standard deviations after {max_steps} rounds; "
+                "use another method",
                 values,
             )
         solution = _packed(problem, iteration, noise)

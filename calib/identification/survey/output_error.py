@@ -113,7 +113,9 @@ class _OutputError(Method):
         fit = _packed(task, plain, values, residual, slopes, std)
         step = np.linalg.norm(_gradient(residual / std, slopes / std[:, None]))
         if not solution.status.good and step > 0.5:
-            raise NotConverged(f"{self.name}: {solution.status.value} ({step:.2g} standard deviations from rest)", fit)
+            raise NotConverged(
+                f"{self.name}: {solution.status.value} ({step:.2g} standard deviations in the last step)", fit
+            )
         simulations = task.count[0]
         return replace(
             plain,

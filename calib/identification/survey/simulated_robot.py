@@ -80,9 +80,9 @@ def simulate_tangents(
 
     for term in plant.terms:
         message = (
-            f"term '{term.name}' ({term.shape}): no derivatives of friction that hangs on past motion or on torques"
+            f"term '{term.name}' ({term.shape}): no derivatives of friction that depends on past motion or on torques"
         )
-        require(term.form.slopes, f"{message}; iv and didim take it")
+        require(term.form.slopes, f"{message}; methods iv and didim support it")
     n = plant.bodies.n
     count = len(reference.t)
     c = len(columns)

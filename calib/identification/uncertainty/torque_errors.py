@@ -133,7 +133,9 @@ def read_uncertainty(folder: Path, dynamics: Dynamics, carried: Sequence[str]) -
     if not (folder / COVARIANCE).is_file():
         return None
     names, covariance = read_covariance(folder)
-    with refused_as(UsageError, ValueError, f"{folder}/covariance.csv and dynamics.json do not match: {{}}"):
+    with refused_as(
+        UsageError, ValueError, f"{folder}/covariance.csv and dynamics.json do not match: {{}}; identify again"
+    ):
         columns = estimated_columns(dynamics, names)
     return Uncertainty(dynamics, tuple(carried), columns, covariance)
 

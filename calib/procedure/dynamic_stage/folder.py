@@ -105,7 +105,7 @@ class IdentificationFolder:
     def judged(self) -> UnseenReport:
         """Report of the model's errors on held-out motion.
 
-        The session's report if there is one, otherwise the report that `calib identify` wrote.
+        It is the session's report if there is one, otherwise the report that `calib identify` wrote.
         """
         return (self.unseen if self.unseen.report.is_file() else UnseenFolder(self.path)).read()
 
@@ -138,7 +138,7 @@ class IdentificationFolder:
 
 
 def _number_of_table(path: Path) -> int:
-    """Return the number in the name of a table of torques, torques_12.csv."""
+    """Return the number in the file name of a table of torques, such as 12 for ``torques_12.csv``."""
     return int(path.stem.rpartition("_")[2])
 
 
@@ -151,7 +151,12 @@ class UnseenFolder:
     report = folders.InFolder(folders.REPORT)  # scores, verdict, and curves for the certificate
 
     def write(self, inputs: IdentificationInputs, assessment: DynamicsAssessment) -> None:
-        """Write one table of torques for each held-out recording, and the report on the model's errors."""
+        """Write one table of torques for each held-out recording, and the report on the model's errors.
+
+        Args:
+            inputs: robot, recordings and options.
+            assessment: the model's predictions and errors on the held-out recordings, and the verdict.
+        """
         for number, case in enumerate(inputs.unseen, 1):
             predicted, intervals = assessment.predictions[case.name], assessment.intervals.get(case.name)
             _write_torques(inputs, case, predicted, intervals, self.path / f"torques_{number}.csv")
@@ -205,7 +210,12 @@ def write_folder(
 
 
 def _write_all(outcome: IdentificationOutcome, folder: Path) -> None:
-    """Write all files of an identification into a folder, except figures and report pages."""
+    """Write all files of an identification into a folder, except figures and report pages.
+
+    Args:
+        outcome: the identification with its errors and verdict.
+        folder: the folder.
+    """
     inputs, identification = outcome.inputs, outcome.found
     robot = inputs.robot
     if isinstance(robot, Mechanism):
@@ -282,10 +292,12 @@ def _write_torques(
 def read_torques(path: Path) -> dict[str, np.ndarray]:
     """Read a table of torques written for a recording without a payload.
 
+    Args:
+        path: the CSV file.
+
     Returns:
         Arrays by name: measured and predicted torques (N, rows), and joint positions q, velocities v and accelerations
-            a
-        (N, n); empty if the table has no velocities and accelerations.
+        a (N, n); empty if the table has no velocities and accelerations.
     """
     table = read_table(path)
     blocks = {}
@@ -302,6 +314,9 @@ def _estimate_rows(outcome: IdentificationOutcome) -> list[tuple[object, ...]]:
     The σ of a parameter is its total σ, from torque noise and geometry; the relative standard deviation (RSD) is in
     percent. The σ from the geometry is NaN if the geometry is taken as exact. Friction terms that were switched off,
     and parameters fixed by a constraint, have no σ (NaN), because they were not estimated from the measurement.
+
+    Args:
+        outcome: the identification with its errors and verdict.
     """
     identification, carried = outcome.found, outcome.carried
     estimate = identification.fitted.estimate
@@ -339,6 +354,11 @@ def _expressions(identification: Identification, unmeasured: Sequence[str], boun
     """Return for each parameter a text that explains it.
 
     The text is a combination of standard parameters, or the name of a drive term's shape (such as a friction term).
+
+    Args:
+        identification: the identification.
+        unmeasured: names of the drive terms that were switched off since nothing was measured for them.
+        bound: names of the parameters that a constraint fixes at its bound.
     """
     lines = [line.split(" = ", 1)[1] for line in expressions(identification.base)]
     for term in identification.friction.terms:

@@ -43,7 +43,12 @@ TORQUE_COVARIANCE = "covariance_torque.csv"
 
 @dataclass(frozen=True)
 class TiltEffect:
-    """Parameter that changes most if the base is tilted by 1 mrad, and its change in σ from torque noise."""
+    """Parameter that changes most if the base is tilted by 1 mrad.
+
+    Attributes:
+        parameter: name of the parameter.
+        sigmas: its change, divided by its standard deviation from torque noise.
+    """
 
     parameter: str
     sigmas: float
@@ -51,7 +56,13 @@ class TiltEffect:
 
 @dataclass(frozen=True)
 class CalibrationChange:
-    """Change of a parameter from the nominal to the calibrated geometry, in units of its total σ and in percent."""
+    """Difference of a parameter between the estimates on the nominal and on the calibrated geometry.
+
+    Attributes:
+        name: name of the parameter.
+        sigmas: nominal minus calibrated estimate, divided by the parameter's total σ.
+        percent: nominal minus calibrated estimate, in percent of the calibrated one.
+    """
 
     name: str
     sigmas: float
@@ -82,7 +93,16 @@ class GeometryMetrics:
 
 
 class TwoGeometries(NamedTuple):
-    """A row of ``geometries.csv``: a parameter identified on the nominal and on the calibrated geometry."""
+    """A row of ``geometries.csv``: a parameter identified on the nominal and on the calibrated geometry.
+
+    Attributes:
+        name, unit: name and unit of the parameter.
+        nominal, sigma_nominal: estimate on the nominal geometry, and its σ from torque noise.
+        calibrated, sigma_calibrated: estimate on the calibrated geometry, and its total σ.
+        relative_percent: nominal minus calibrated estimate, in percent of the calibrated one; NaN if that is zero.
+        sigma_difference: standard deviation of the difference.
+        essential: ``yes`` for essential parameters, otherwise ``no``.
+    """
 
     name: str
     unit: str
@@ -96,7 +116,23 @@ class TwoGeometries(NamedTuple):
 
 
 class GeometricEffect(NamedTuple):
-    """A row of ``geometry_effects.csv``: the effect of one σ of a geometric element on the dynamic parameters."""
+    """A row of ``geometry_effects.csv``: the effect of a geometric element's uncertainty on the dynamic parameters.
+
+    Attributes:
+        rank: rank of the element by `shift_sigma`, from 1.
+        element, unit: name and unit (m or rad) of the element.
+        sigma: σ of the element; not finite, or None in the file, if it was not fitted.
+        matters: ``yes`` if the element alone raises the σ of some parameter by more than 1 %, else ``no``; empty
+            without σ.
+        parameter: name of the parameter that the element shifts most; empty if it shifts none.
+        shift_sigma: shift of this parameter if the element changes by one σ, divided by the parameter's σ from torque
+            noise.
+        parameters_moved: number of parameters whose σ the element alone raises by more than 1 %; None without σ.
+        torque_rms: rms change of the rigid-body torque if the element changes by one σ, at constant parameters [N m or
+            N].
+        torque_rms_left: the same after the parameters have been estimated again [N m or N].
+        shift_sigma_per_milli: shift as `shift_sigma`, for a change of the element by 1 mm or 1 mrad.
+    """
 
     rank: int
     element: str
@@ -115,6 +151,10 @@ def write(outcome: IdentificationOutcome, folder: Path) -> None:
     """Write the tables of sensitivities, of ranked geometric effects, and of the estimates on both geometries.
 
     Nothing is written if the effect of the geometry was not computed.
+
+    Args:
+        outcome: the identification; its effect of the geometry may be None.
+        folder: folder to write into.
     """
     carried = outcome.carried
     if carried is None:
@@ -133,6 +173,9 @@ def _ranking(carried: GeometryUncertainty) -> np.ndarray:
     """Return the indices of the geometric elements, sorted by the largest parameter shift that one σ causes.
 
     Elements without σ are last.
+
+    Args:
+        carried: effect of the geometry's uncertainty on the parameters.
     """
     has_sigma = np.isfinite(carried.deviations)
     shift_per_unit = _per_sigma(carried).max(axis=0, initial=0.0)
@@ -149,6 +192,9 @@ def effects(carried: GeometryUncertainty) -> list[GeometricEffect]:
     `torque_rms` is the rms change of the rigid-body torque by one σ at constant parameters; `torque_rms_left` is the
     change that remains after the parameters have been estimated again. `matters` is ``yes`` if the element alone raises
     the σ of some parameter by more than 1 %; it is empty for elements without σ.
+
+    Args:
+        carried: effect of the geometry's uncertainty on the parameters.
     """
     rows = []
     shifts_per_unit = _per_sigma(carried)
@@ -179,7 +225,12 @@ def effects(carried: GeometryUncertainty) -> list[GeometricEffect]:
 
 
 def _geometries(comparison: GeometryComparison, essential: Sequence[str]) -> Iterator[TwoGeometries]:
-    """Yield the rows of ``geometries.csv``: each parameter identified on the nominal and on the calibrated geometry."""
+    """Yield the rows of ``geometries.csv``: each parameter identified on the nominal and on the calibrated geometry.
+
+    Args:
+        comparison: estimates on the nominal and on the calibrated geometry.
+        essential: names of the essential parameters, which are marked.
+    """
     nominal, calibrated = comparison.values
     sigma_nominal, sigma_calibrated = comparison.sigma
     relative = np.where(np.isfinite(comparison.relative), comparison.relative, np.nan)
@@ -198,7 +249,11 @@ def _geometries(comparison: GeometryComparison, essential: Sequence[str]) -> Ite
 
 
 def _essential_names(outcome: IdentificationOutcome) -> tuple[str, ...]:
-    """Return the names of the essential parameters; if no parameters were eliminated, all names."""
+    """Return the names of the essential parameters; if no parameters were eliminated, all names.
+
+    Args:
+        outcome: the identification.
+    """
     identification = outcome.found
     if identification.elimination is None:
         return identification.names
@@ -232,7 +287,11 @@ def _marked(names: Sequence[str], mask: np.ndarray) -> tuple[str, ...]:
 
 
 def summary(carried: GeometryUncertainty) -> str:
-    """Return a sentence for the user on the effect of the geometry's uncertainty on the parameters' σ."""
+    """Return a sentence for the user on the effect of the geometry's uncertainty on the parameters' σ.
+
+    Args:
+        carried: effect of the geometry's uncertainty on the parameters.
+    """
     if carried.geometry is None:
         return (
             "the geometry is assumed exact, sigmas contain torque noise only: the robot has no covariance of its "
@@ -247,28 +306,42 @@ def summary(carried: GeometryUncertainty) -> str:
         sentence += f" and leaves {p - count} unchanged"
     dominated = _marked(carried.names, carried.dominated)
     if dominated:
-        sentence += f"; for {len(dominated)} it contributes more than torque noise: {', '.join(dominated)}"
+        sentence += f"; for {len(dominated)} the geometry contributes more than torque noise: {', '.join(dominated)}"
     return sentence
 
 
 def _tilt(carried: GeometryUncertainty) -> TiltEffect:
-    """Return the parameter that changes most if the base is tilted by 1 mrad, and its change in σ from torque noise."""
+    """Return the parameter that changes most if the base is tilted by 1 mrad, and its change.
+
+    The change is in multiples of the parameter's σ from torque noise.
+
+    Args:
+        carried: effect of the geometry's uncertainty on the parameters.
+    """
     size = 1e-3 * _per_sigma(carried)[:, -len(TILTS) :].max(axis=1, initial=0.0)
     worst = int(np.argmax(size))
     return TiltEffect(carried.names[worst], float(size[worst]))
 
 
 def _per_sigma(carried: GeometryUncertainty) -> np.ndarray:
-    """Return |sensitivity| of the parameters to the K geometric elements and 2 base tilts, in σ from torque noise.
+    """Return |sensitivity| of the parameters to geometric elements and base tilts, in multiples of σ from torque noise.
 
-    The shape is (p, K + 2) for p parameters; the entries of a parameter without σ are zero.
+    The shape is (p, K + 2) for p parameters, K geometric elements and 2 tilts. The entries of a parameter without σ are
+    zero.
+
+    Args:
+        carried: effect of the geometry's uncertainty on the parameters.
     """
     sigma = carried.sigma_torque[:, None]
     return np.divide(np.abs(carried.sensitivity), sigma, out=np.zeros(carried.sensitivity.shape), where=sigma > 0.0)
 
 
 def _largest(comparison: GeometryComparison) -> tuple[CalibrationChange, ...]:
-    """Return the five parameters with the largest changes between the geometries, in total σ and in percent."""
+    """Return the five parameters with the largest changes between the geometries, in total σ and in percent.
+
+    Args:
+        comparison: estimates on the nominal and on the calibrated geometry.
+    """
     nominal, calibrated = comparison.values
     _, sigma = comparison.sigma
     size = (nominal - calibrated) / np.where(sigma > 0.0, sigma, np.inf)

@@ -19,8 +19,13 @@ MAX_COMPARED = 12  # recordings in which an unstated load is looked for (our cho
 def gravity_hypotheses(inputs: IdentificationInputs) -> GravityHypotheses | None:
     """Return how well other gravity vectors explain the training recordings.
 
-    The recordings are grouped by payload, and the group with the most recordings is used. None without motor torques or
-    with too few samples.
+    The recordings are grouped by payload, and the group with the most recordings is used.
+
+    Args:
+        inputs: robot, recordings and options.
+
+    Returns:
+        The hypotheses; None without motor torques or with too few samples.
     """
     if not isinstance(inputs.chain, Chain) or not inputs.options.settings.torque_rows.has_bodies:
         return None
@@ -63,7 +68,7 @@ def gravity_findings(hypotheses: GravityHypotheses | None, joints: Sequence[str]
 def load_findings(inputs: IdentificationInputs, gravity: Sequence[float] | None) -> list[Finding]:
     """Return a finding for each recording whose torques indicate a load that the options do not state.
 
-    Training and held-out recordings with the same stated payload are compared with each other.
+    All recordings, training and held-out ones, with one stated payload are compared with each other.
 
     Args:
         inputs: the recordings.
@@ -103,5 +108,5 @@ def _typical(shares: np.ndarray) -> float:
 
 
 def _vector(vector: np.ndarray, between: str) -> str:
-    """Return a vector (3,) [m/s²] as text, with the components separated by the given text."""
+    """Return a vector (3,) [m/s²] as text, with the components separated by the text `between`."""
     return between.join(f"{component:.4g}" for component in np.round(vector, 3) + 0.0)

@@ -37,8 +37,7 @@ REPEAT = 0.5
 
 @dataclass(frozen=True, eq=False)
 class ModelFindings:
-    """Findings on an identified model that the verdict needs in addition to the recordings; stored in the model's
-    folder.
+    """Findings on an identified model, stored in the model's folder; the verdict needs them besides recordings.
 
     Attributes:
         rests: parameters whose values are determined by a prior instead of the recordings.
@@ -70,7 +69,7 @@ class RecordingErrors:
         predictions: name of a recording -> predicted torques (N, rows) at the full sampling rate.
         repeated: name of a held-out recording that repeats training motion -> share of its states (position, velocity)
             that are also in the training motion.
-        excitation: name of a training recording -> report on what its motion can identify.
+        excitation: name of a training recording -> report on the parameters that its motion can identify.
         intervals: name of a held-out recording -> expected torque errors; without held-out recordings, those of the
             first training recording.
     """
@@ -93,7 +92,7 @@ class DynamicsAssessment(RecordingErrors):
     """Errors of a model on the recordings, and the verdict.
 
     Attributes:
-        verdict: see `calib.procedure.dynamic_stage.verdict`.
+        verdict: the verdict, by the rules of `calib.procedure.dynamic_stage.verdict`.
         warnings: texts for the user on the recordings and the model.
         noticed: the findings whose sentences are in the warnings.
         tracking: name of a recording -> simulated tracking with the model as feedforward.
@@ -110,10 +109,13 @@ class DynamicsAssessment(RecordingErrors):
 
 
 def repeated_motion(cases: Sequence[Case], unseen: Sequence[Case]) -> dict[str, float]:
-    """Return the held-out recordings that repeat training motion: name -> share of states that are also in the
-    training.
+    """Return the held-out recordings that repeat training motion: name -> share of their states in the training.
 
-    A recording counts as a repeat from a share of `REPEAT`.
+    A state is a position with its velocity. A recording counts as a repeat from a share of `REPEAT`.
+
+    Args:
+        cases: training recordings.
+        unseen: held-out recordings.
     """
     repeated = {}
     for case in unseen:
@@ -124,7 +126,12 @@ def repeated_motion(cases: Sequence[Case], unseen: Sequence[Case]) -> dict[str, 
 
 
 def overlaps(cases: Sequence[Case], unseen: Sequence[Case]) -> list[Finding]:
-    """Return findings on held-out recordings that share samples with a training recording."""
+    """Return findings on held-out recordings that share samples with a training recording.
+
+    Args:
+        cases: training recordings.
+        unseen: held-out recordings.
+    """
     findings = []
     for case, training in product(unseen, cases):
         if not training.motion.file or realpath(case.motion.file) != realpath(training.motion.file):
@@ -296,6 +303,10 @@ def run(inputs: IdentificationInputs, progress: Progress | None = None) -> Ident
 
     If the torques refute the stated gravity, only the standard friction model is tried, since richer friction, such as
     couplings between joints, would absorb the gravity error.
+
+    Args:
+        inputs: robot, recordings and options.
+        progress: called with a text on each step; None: silent.
     """
     settings = inputs.options.settings
     hypotheses = gravity_hypotheses(inputs)
@@ -308,6 +319,11 @@ def judged(
     inputs: IdentificationInputs, found: Identification, progress: Progress | None = None
 ) -> IdentificationOutcome:
     """Return the outcome of a finished identification: torque predictions for every recording, errors, and the verdict.
+
+    Args:
+        inputs: robot, recordings and options.
+        found: the identification.
+        progress: called with a text on each step; None: silent.
 
     Raises:
         MeasurementError: if the identified friction accelerates most joints instead of braking them.
@@ -341,7 +357,7 @@ def judged(
 
 
 def assessed(outcome: T, inputs: IdentificationInputs) -> T:
-    """Return an outcome with predictions, errors and verdict for the recordings of `inputs`, by the unchanged model."""
+    """Return an outcome with the predictions of its unchanged model for the recordings of `inputs`, and the verdict."""
     stage = stage_of(inputs.robot, "identify")
     if stage is not None and stage.judge is not None:
         assessment = stage.judge(inputs, outcome.found, outcome.findings)
@@ -356,6 +372,11 @@ def _carry(
     """Return the effect of the geometry's uncertainty on the estimate, and the comparison with the nominal geometry.
 
     The comparison is None if the robot's geometry is the nominal one.
+
+    Args:
+        inputs: robot and recordings.
+        identification: the identified model.
+        say: called with a text on each step.
     """
     carried = geometry_uncertainty.propagate(identification, inputs.robot, inputs.cases, say)
     if inputs.robot.nominal is None or not inputs.robot.moved:

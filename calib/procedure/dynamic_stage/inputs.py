@@ -138,12 +138,12 @@ def gather(
     """Return the inputs of an identification from files: the robot, and all recordings as filtered motions.
 
     Args:
-        robot: a name or file as in `calib.robot.library`, or a robot returned by a geometric fit.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
         recordings, validate: training and held-out recordings: paths, each with an optional cut (``log.npz@0:9.4``), or
             recordings in memory.
         options: content of the options file; None: defaults.
         method, friction: identification method and friction model; None: as in the options.
-        base, tip: links of a URDF at which the chain begins and ends; None: see `calib.robot.library`.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
         seed: seed of all random numbers.
         designed: designed motions, which are searched in recordings without a reference if the options have a [loop].
         progress: called with a text on each step; None: silent.
@@ -199,7 +199,7 @@ def gather(
         if shifts:
             effect = f"move the links by up to {1e3 * max(shifts):.3g} mrad or mm"
         else:
-            effect = "take no part: the links are rigid"
+            effect = "are not used: the links are rigid"
             described = described.without_corrections()
         notes.append(f"joint corrections of the geometric fit {effect}")
     return IdentificationInputs(
@@ -214,11 +214,16 @@ def gather(
 
 
 def silent(words: str) -> None:
-    """Ignore a progress text."""
+    """Ignore a progress text, `words`."""
 
 
 def _check_payloads(cases: Sequence[Case], unseen: Sequence[Case], settings: IdentificationSettings) -> None:
     """Check that the payload of each held-out recording is identifiable or known.
+
+    Args:
+        cases: training recordings.
+        unseen: held-out recordings.
+        settings: settings of the identification with the payloads.
 
     Raises:
         UsageError: for a payload that is neither carried in a training recording nor stated in the options.
@@ -253,6 +258,11 @@ def _path(recording: str | Path | Recording) -> str:
 def _with_choices(options: IdentifyOptions, method: str | None, friction: str | None, seed: int) -> IdentifyOptions:
     """Return the options with the method, friction model and seed that the command states; None: as in the options.
 
+    Args:
+        options: content of the options file.
+        method, friction: identification method and friction model; None: as in the options.
+        seed: seed of all random numbers.
+
     Raises:
         UsageError: for an unknown method or friction model.
     """
@@ -276,6 +286,14 @@ def _read_case(path: str, name: str, motion: Motion, options: IdentifyOptions, g
     """Return a recording as a `Case`: motion, torques by drive gains, payload, and the links' motion.
 
     The links' motion differs from the joints' motion only if the robot has joint corrections.
+
+    Args:
+        path: path of the recording, by which the options refer to it.
+        name: name of the recording in results and messages.
+        motion: the filtered motion.
+        options: content of the options file.
+        gains: drive gains.
+        robot: the calibrated robot.
     """
     file_options = options.file_settings(path)
     rows = options.settings.torque_rows
@@ -295,7 +313,7 @@ def read_motion(
     Args:
         given: a path, with an optional cut, or a recording in memory.
         chain: the robot, or its joints.
-        own: the options for the recording's file.
+        own: the options for this recording.
         like: motion whose identification band is used if the options state no band; the cutoff of the position filter
             still follows from the recording. None: both follow from the recording.
     """
@@ -326,7 +344,7 @@ def read_motion(
         band=min(band, MAX_BAND * motion.rate),
     )
     wider = make_motion(recording, wider_options, sampled, motion.cutoffs)
-    note = f"f_p = {wider.band:.3g} Hz instead, so that decimation does not remove the ends of a short recording"
+    note = f"identification band f_p = {wider.band:.3g} Hz instead, to keep the ends of a short recording"
     return replace(wider, notes=(*motion.notes, note))
 
 
@@ -339,6 +357,12 @@ def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampl
 
     The default f_q ≥ 5 f_dyn is only a minimum. f_q is doubled if the resulting acceleration noise stays below `QUIET`
     times the rms acceleration of every moving joint (our choice).
+
+    Args:
+        recording: the recording.
+        motion: the recording, filtered with the default cutoff.
+        options: options of the filters.
+        sampled: the recording at a constant sampling rate.
     """
     rms = np.sqrt(np.mean(motion.a**2, axis=0))
     moves = np.ptp(motion.q, axis=0) > MIN_RANGE
@@ -351,7 +375,7 @@ def _sharper(recording: Recording, motion: Motion, options: FilterOptions, sampl
     borders = 2.0 / cutoff if options.borders is None else options.borders
     sharper_options = replace(options, velocity_cutoff=_joints(motion.velocity_cutoff), borders=borders, cutoff=doubled)
     sharper = make_motion(recording, sharper_options, sampled, motion.cutoffs)
-    note = f"f_q = {doubled:.3g} Hz instead: the position noise is low enough"
+    note = f"cut-off of positions f_q = {doubled:.3g} Hz instead: the position noise is low enough"
     return replace(sharper, notes=(*motion.notes, note))
 
 
@@ -365,6 +389,13 @@ def _referred(
     """Return the motion with reference positions of the control loop, if the options describe a control loop.
 
     The reference positions are from a file named in the options, from the recording, or from a designed motion.
+
+    Args:
+        motion: the filtered motion.
+        recording: the recording, or its path.
+        joints: the robot's joints.
+        options: content of the options file.
+        designed: designed motions, which are searched in the recording.
     """
     file_options, loop = options.file_settings(_path(recording)), options.settings.loop
     if loop is None:
@@ -388,10 +419,17 @@ def _with_design(
     options: FileSettings,
     designed: Sequence[DesignedMotion],
 ) -> Motion:
-    """Return the part of a motion in which whole periods of a designed motion were played, with the design as
-    reference.
+    """Return the part of a motion in which whole periods of a designed motion were played, with reference positions.
 
-    The designed motion is searched in the whole file, since a cut may contain less than a period.
+    The reference positions are those of the designed motion. It is searched in the whole file, since a cut may contain
+    less than a period.
+
+    Args:
+        motion: the filtered motion of the recording.
+        source: the recording, or its path with an optional cut.
+        joints: the robot's joints.
+        options: the options for this recording.
+        designed: designed motions to search for.
 
     Raises:
         MeasurementError: if no designed motion is found.
@@ -410,11 +448,19 @@ def _with_design(
             part = slice(start, stop)
             q_ref = frozen(design.orders(motion.t[part] - located.began)[0])
             return replace(motion.part(part), q_ref=q_ref, located=located.began)
-    refuse_data(motion.file, "has no reference positions (q_ref), and contains none of the designed motions whole")
+    refuse_data(
+        motion.file,
+        "has no reference positions (q_ref), and contains none of the designed motions whole: log the reference, or "
+        "record again",
+    )
 
 
 def _check_files(options: IdentifyOptions, paths: Sequence[str]) -> None:
     """Check that each entry of the options' table ``[files]`` names one of the recordings.
+
+    Args:
+        options: content of the options file.
+        paths: paths of all recordings.
 
     Raises:
         UsageError: for an entry that matches no recording.

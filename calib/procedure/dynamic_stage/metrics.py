@@ -41,7 +41,7 @@ BOUND_SIGMA = 1e-9
 
 @dataclass(frozen=True)
 class ParameterCounts:
-    """Numbers of standard parameters, base parameters (identifiable from any motion), and essential parameters."""
+    """Numbers of standard parameters, base parameters (identifiable from some motion), and essential parameters."""
 
     standard: int
     base: int
@@ -66,7 +66,16 @@ class ConditionNumber:
 
 @dataclass(frozen=True, eq=False)
 class FilterMetrics:
-    """Sampling rate, cutoffs f_q and f_v by joint, identification band f_p, all in Hz, and the decimation factor."""
+    """Filters of a recording.
+
+    Attributes:
+        rate: sampling rate [Hz].
+        cutoff: (n,) cutoff f_q of the positions' filter, by joint [Hz].
+        band: upper limit f_p of the identification band [Hz].
+        decimation: number of samples per row of the identification.
+        velocity_cutoff: (n,) cutoff f_v of the velocities' filter, by joint [Hz]; None in files of version 0.1: equal
+            to `cutoff`.
+    """
 
     rate: float
     cutoff: Array
@@ -83,9 +92,12 @@ class FilterMetrics:
 
 @dataclass(frozen=True, eq=False)
 class ConstraintMetrics:
-    """Names of an estimate's constraints, the constraints at their bounds, and the number of postures at a bound.
+    """Constraints of an estimate.
 
-    A posture is at a bound if the inertia matrix M(q) is at the bound of positive definiteness there.
+    Attributes:
+        names: names of the constraints.
+        binding: the constraints that are at their bounds.
+        postures_binding: number of postures at which the inertia matrix is at the bound of positive definiteness.
     """
 
     names: tuple[str, ...]
@@ -141,7 +153,31 @@ def _judged(assessment: DynamicsAssessment) -> FieldValues:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ModelMetrics(JudgedMetrics):
-    """The content of an identification's ``metrics.json``; see `calib.identification.model_file`."""
+    """The content of an identification's ``metrics.json``.
+
+    Attributes:
+        identification: name of a training recording -> score of the model.
+        parameters, counts: numbers of parameters, and of standard parameters that are not estimated.
+        condition_number: condition number of the observation matrix.
+        friction: name of the friction model.
+        method, method_assumes: identification method, and its assumption as text.
+        ladder: tried friction models with their errors.
+        ripple: torque ripple of the joints; empty: not modelled.
+        elimination: steps of the elimination of parameters that are not essential; empty: none.
+        unit: unit of the torques.
+        switched_off: names of drive terms that were switched off, since nothing was measured for them.
+        drive_gains: identified drive gains; None: none.
+        loop: results of the closed-loop simulation; None: none.
+        constraints: constraints of the estimate; None: none.
+        filters: name of a recording -> its filters.
+        geometry: effect of the geometry's uncertainty; None: not computed.
+        repeated: name of a held-out recording that repeats training motion -> share of its states in the training.
+        findings: findings that the verdict needs besides the recordings; None in files of earlier versions.
+        error_density: (rows,) spectral density of the torque errors [N² m² s or N² s]; None in files of earlier
+            versions.
+        seed: seed of all random numbers.
+        schema: version of the file's format.
+    """
 
     identification: Mapping[str, Score]
     parameters: ParameterCounts
@@ -172,6 +208,9 @@ def on_bounds(identification: Identification) -> tuple[str, ...]:
 
     The recordings do not identify these parameters, so that they have no σ. The covariance treats the constraint as an
     equality; the σ of the other parameters therefore assume that the fixed values are exact.
+
+    Args:
+        identification: the identification with its constrained estimate.
     """
     constrained = identification.fitted.held
     if constrained is None:
@@ -185,7 +224,7 @@ def on_bounds(identification: Identification) -> tuple[str, ...]:
 
 
 def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
-    """Return the content of ``metrics.json`` for an identification."""
+    """Return the content of ``metrics.json`` for the outcome of an identification."""
     identification, inputs = outcome.found, outcome.inputs
     base, constrained = identification.base, identification.fitted.held
     count = base.b + len(identification.friction.terms)
@@ -224,8 +263,13 @@ def metrics(outcome: IdentificationOutcome) -> ModelMetrics:
 def _error_density(identification: Identification, cases: Sequence[Case]) -> np.ndarray:
     """Return the spectral density of the torque errors (rows,) [N² m² s or N² s].
 
-    The density is the variance of the errors divided by the number of independent rows per second; the information
-    matrix of a motion with regressor ω is ∫ ωᵀω / density dt.
+    The density is the variance of the errors divided by the number of independent rows per second. With it, the
+    information matrix of a motion is ∫ ωᵀω / density dt, where ω is the regressor, the matrix that maps parameters to
+    torques.
+
+    Args:
+        identification: the identification.
+        cases: training recordings.
     """
     count = sum(len(rows.target) for rows in identification.rows)
     per_second = count / sum(case.duration for case in cases)
@@ -253,7 +297,12 @@ class TorqueCurves:
 
     @classmethod
     def of(cls, case: Case, predicted: np.ndarray) -> TorqueCurves:
-        """Return the curves of a recording and the torques (N, rows) that the model predicts for it."""
+        """Return the curves of measured and predicted torques of a recording, thinned for drawing.
+
+        Args:
+            case: the recording with N samples.
+            predicted: (N, rows) torques that the model predicts for it.
+        """
         motion, measured = case.motion, np.asarray(case.target)
         picked = evenly(len(measured), MAX_POINTS)
         measured_in_band = _five_digits(motion.in_band(measured)[picked].T)
@@ -363,7 +412,7 @@ def _score(score: ParsedTable) -> ParsedTable:
 
 
 def _replay(replay: ParsedTable) -> ParsedTable:
-    """Return the simulated tracking in a file of an earlier version with the current keys."""
+    """Return the simulated tracking (`replay`) in a file of an earlier version with the current keys."""
     stored = replay["controller"]
     controller = None
     if "kp" in stored:

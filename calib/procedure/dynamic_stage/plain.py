@@ -53,6 +53,9 @@ def plain_values(identification: Identification[RegressorModel]) -> np.ndarray:
     """Return the parameters (p,) of the identified model, estimated by plain weighted least squares.
 
     Terms beyond the standard model are zero. A payload that no training recording carries keeps its known parameters.
+
+    Args:
+        identification: the identification with its recordings.
     """
     base, dynamics = identification.base, identification.dynamics
     torque_rows = identification.rows[0].target.shape[1]
@@ -75,8 +78,8 @@ def truncated(data: Triangles) -> np.ndarray:
     """Return the weighted least-squares values (p,) of minimum norm, truncated at the data's rank.
 
     Args:
-        data: R factors of the rows, one group per torque row; each group is weighted by the inverse rms of its
-            residuals.
+        data: triangular factors R of the regression's rows (Rᵀ R: normal equations), one group per torque row; each
+            group is weighted by the inverse rms of its residuals.
     """
     weight, values = np.ones(data.groups), np.zeros(data.parameters)
     for _ in range(ROUNDS):
@@ -95,6 +98,10 @@ def nominal_values(chain: Chain, dynamics: Dynamics[RegressorModel]) -> np.ndarr
     """Return the model's parameters (p,) from the masses of the robot's description, without friction.
 
     None if the description states no masses, or if the torque rows contain no rigid-body torques.
+
+    Args:
+        chain: the arm with the masses and inertias of its description.
+        dynamics: the identified model, which determines the parameters and their order.
     """
     inertias = getattr(chain, "inertias", None)
     if inertias is None or not np.any(inertias[:, 9] > 0.0) or not dynamics.model.torque_rows.has_bodies:
@@ -144,6 +151,13 @@ def _unexplained(
     """Return the unexplained share 100 ‖τ - τ̂‖ / ‖τ‖ [%] of the torques τ of a recording; NaN without torques.
 
     Samples and frequencies are those that count in the model's score, see `Score.judged`.
+
+    Args:
+        case: the recording with N samples.
+        predicted: (N, rows) predicted torques.
+        score: the model's score on the recording, which states whether noise or standing joints are excluded.
+        slow: speed below which a joint counts as standing; None: default speed.
+        apart: indices of rows that have another unit and are not counted.
     """
     motion = case.motion
     rows = case.target.shape[1]
@@ -161,10 +175,12 @@ def _unexplained(
 
 
 def worse_than_plain(errors_by_file: Mapping[str, PlainReferences]) -> list[Finding]:
-    """Return a finding on the held-out recording on which plain least squares is better than the model by the largest
-    factor.
+    """Return a finding on the held-out recording on which plain least squares is better by the largest factor.
 
-    An empty list if the factor is below the catalogue's limit on every recording.
+    An empty list if plain least squares is better than the model by less than the catalogue's limit on every recording.
+
+    Args:
+        errors_by_file: name of a recording -> errors of the model and of the plain references.
     """
     ratios = {}
     for name, errors in errors_by_file.items():

@@ -69,7 +69,7 @@ def implausible(
 
 
 def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Finding]:
-    """Return findings on implausible sizes of torques and velocities, and on wrong clocks, of recordings.
+    """Return findings on torques and velocities of implausible size in recordings, and on wrong clocks.
 
     Args:
         sizes: for each recording, the sizes of its quantities compared with the robot's description.
@@ -102,12 +102,21 @@ def findings(sizes: Sequence[RecordingSizes], joints: Sequence[str]) -> list[Fin
 
 
 def _of_some_level(candidates: Iterable[Finding]) -> list[Finding]:
-    """Return the findings whose values reach a level (note, marginal or fail) of the catalogue."""
+    """Return the findings whose values reach a level (note, marginal or fail) of the catalogue.
+
+    Args:
+        candidates: findings with their values.
+    """
     return [candidate for candidate in candidates if level_of(candidate)]
 
 
 def standing_columns(cases: Sequence[Case], joints: Sequence[str]) -> list[Finding]:
-    """Return findings on clipped torques, and on positions or velocities that stay constant while a joint moves."""
+    """Return findings on clipped torques, and on positions or velocities that stay constant while a joint moves.
+
+    Args:
+        cases: the recordings.
+        joints: names of the joints.
+    """
     result = []
     for case in cases:
         clipped, values = [], []
@@ -171,7 +180,11 @@ def _joints_of_change(change: Change) -> tuple[int, ...]:
 
 
 def impossible(contradiction: Contradiction | None) -> list[Finding]:
-    """Return a finding if an estimate is far from every physically consistent robot; otherwise an empty list."""
+    """Return a finding if an estimate is far from every physically consistent robot; otherwise an empty list.
+
+    Args:
+        contradiction: distance of the estimate from every physically consistent robot; None: unknown.
+    """
     if contradiction is None:
         return []
     candidate = finding(
@@ -185,7 +198,7 @@ def impossible(contradiction: Contradiction | None) -> list[Finding]:
 
 
 def described(chain: Chain) -> list[Finding]:
-    """Return a finding if the robot's description contains physically inconsistent bodies; otherwise an empty list."""
+    """Return a finding if the description of `chain` has physically inconsistent bodies; otherwise an empty list."""
     bodies = impossible_bodies(chain)
     return [finding("inconsistent-bodies", bodies=bodies)] if bodies else []
 
@@ -198,10 +211,19 @@ def another_loop(disagreement: LoopDisagreement | None) -> list[Finding]:
     """
     if disagreement is None:
         return []
-    factors, median = np.array(disagreement.factor), float(np.median(disagreement.factor))
-    # one factor at all joints, or one at each, or else another velocity
-    scaled = bool(np.ptp(factors) < MAX_FACTOR_SPREAD * abs(median) and abs(median - 1.0) > MIN_FACTOR_ERROR)
-    by_joint = not scaled and bool(np.any(np.abs(factors - 1.0) > MIN_FACTOR_ERROR))
+    factors = np.array(disagreement.factor)
+    median = float(np.median(factors))
+    equal_factors = np.ptp(factors) < MAX_FACTOR_SPREAD * abs(median)
+    # Hypotheses: one factor at all joints, a factor per joint, or else another velocity than the stated one.
+    times = None
+    wrong_factors: list[str] = []
+    velocity = ""
+    if equal_factors and abs(median - 1.0) > MIN_FACTOR_ERROR:
+        times = median
+    elif np.any(np.abs(factors - 1.0) > MIN_FACTOR_ERROR):
+        wrong_factors = _three_digits(disagreement.factor)
+    else:
+        velocity = "reference_velocity"
     return [
         finding(
             "loop-refuted",
@@ -212,9 +234,9 @@ def another_loop(disagreement: LoopDisagreement | None) -> list[Finding]:
             worst=max(disagreement.left),
             left=_three_digits(disagreement.left),
             other_left=_three_digits(disagreement.beside_left),
-            times=median if scaled else None,
-            factors=_three_digits(disagreement.factor) if by_joint else (),
-            velocity="" if scaled or by_joint else "reference_velocity",
+            times=times,
+            factors=wrong_factors,
+            velocity=velocity,
         )
     ]
 
@@ -224,7 +246,12 @@ def _three_digits(numbers: Sequence[float]) -> list[str]:
 
 
 def _masses(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
-    """Yield findings on signs and sizes of torques that disagree with the masses in the robot's description."""
+    """Yield findings on signs and sizes of torques that disagree with the masses in the robot's description.
+
+    Args:
+        recording: sizes of a recording's quantities compared with the robot's description.
+        joints: names of the joints.
+    """
     share = recording.masses
     determined = np.flatnonzero(np.isfinite(share)).tolist()
     if not determined:
@@ -247,7 +274,12 @@ def _off(ratio: np.ndarray | np.floating) -> float:
 
 
 def _limits(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
-    """Yield findings on torques far above or below the joints' torque limits, which indicates another unit."""
+    """Yield findings on torques far above or below the joints' torque limits, which indicates another unit.
+
+    Args:
+        recording: sizes of a recording's quantities compared with the robot's description.
+        joints: names of the joints.
+    """
     limited = np.isfinite(recording.limits)
     if not limited.any():
         return
@@ -267,7 +299,12 @@ def _limits(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Findin
 
 
 def _speed(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
-    """Yield findings on measured velocities whose size differs from that of the differentiated positions."""
+    """Yield findings on measured velocities whose size differs from that of the differentiated positions.
+
+    Args:
+        recording: sizes of a recording's quantities compared with the robot's description.
+        joints: names of the joints.
+    """
     ratio = recording.speed
     measured = np.flatnonzero(np.isfinite(ratio))
     median = float(np.median(ratio[measured])) if len(measured) else 1.0
@@ -317,7 +354,12 @@ def _against(clock: ClockRatio | None, speed_ratio: float) -> str:
 
 
 def _unlike(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Finding]:
-    """Yield a finding on joints whose measured velocities have the wrong sign or are unrelated to the positions."""
+    """Yield a finding on joints whose measured velocities have the wrong sign or are unrelated to the positions.
+
+    Args:
+        recording: sizes of a recording's quantities compared with the robot's description.
+        joints: names of the joints.
+    """
     backwards = [joints[j] for j in np.flatnonzero(recording.follows < -FOLLOWS).tolist()]
     unrelated = [joints[j] for j in np.flatnonzero(np.abs(recording.follows) <= FOLLOWS).tolist()]
     if backwards or unrelated:
@@ -332,7 +374,13 @@ def _unlike(recording: RecordingSizes, joints: Sequence[str]) -> Iterator[Findin
 
 
 def _lag(name: str, lag: Lag | None, joints: Sequence[str]) -> Iterator[Finding]:
-    """Yield findings on torques that are delayed relative to the motion, at all joints or at one joint."""
+    """Yield findings on torques that are delayed relative to the motion, at all joints or at one joint.
+
+    Args:
+        name: name of the recording.
+        lag: delay of its torques [s]; None: no delay was found.
+        joints: names of the joints.
+    """
     if lag is None:
         return
     if lag.certain:
@@ -365,7 +413,12 @@ def _direction(seconds: float) -> str:
 
 
 def _clock(name: str, clock: ClockRatio | None) -> Iterator[Finding]:
-    """Yield a finding if the time stamps contradict the known ratio of inertias to masses."""
+    """Yield a finding if the time stamps contradict the known ratio of inertias to masses.
+
+    Args:
+        name: name of the recording.
+        clock: ratio of inertias to masses found in the torques, relative to the expected ratio; None: unknown.
+    """
     if clock is None:
         return
     times = _off(np.float64(clock.ratio))

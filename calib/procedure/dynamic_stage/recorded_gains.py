@@ -53,10 +53,16 @@ class FoundGains:
         """Return the gains (n,) that apply to a motion; None if the motion contains torques instead of currents.
 
         Gains in the options take precedence over identified gains, and these over gains in the recording.
+
+        Args:
+            motion: the motion.
+            options: the options for its recording.
         """
         if options.gains is not None:
             if len(options.gains) not in (1, motion.n):
-                raise UsageError(f"gains: {len(options.gains)} values for {motion.n} joints ({motion.file})")
+                raise UsageError(
+                    f"gains: {len(options.gains)} values for {motion.n} joints ({motion.file}): state one per joint"
+                )
             return np.broadcast_to(np.array(options.gains), (motion.n,))
         if motion.kind != "current":
             return None
@@ -95,15 +101,22 @@ def find_gains(
     with_gains = [path for path in motions if path not in bare_currents]
     if with_gains:
         raise UsageError(
-            f"{bare_currents[0]} holds currents without gains, {with_gains[0]} torques (or currents with gains): one "
-            "model cannot use both A and N m; state gains for all of them"
+            f"{bare_currents[0]} contains currents without gains, {with_gains[0]} torques (or currents with gains): "
+            "one model cannot use both A and N m; state gains for all of them"
         )
     say("relative drive gains")
     return _relative(chain, options, [(path, motions[path]) for path in training if path in bare_currents])
 
 
 def _from_pair(chain: Chain, options: IdentifyOptions, pair: GainPair, motions: Mapping[str, Motion]) -> FoundGains:
-    """Return absolute drive gains, identified from recordings without and with a payload of known mass."""
+    """Return absolute drive gains, identified from recordings without and with a payload of known mass.
+
+    Args:
+        chain: the arm.
+        options: options of the identification with the payload's mass.
+        pair: names of the recordings without and with the payload.
+        motions: path of a recording -> motion.
+    """
     settings = options.settings
     known_values = {f"M{label}": load.mass for label, load in settings.payloads.items() if load.mass is not None}
     for label, load in settings.payloads.items():
@@ -123,8 +136,8 @@ def _from_pair(chain: Chain, options: IdentifyOptions, pair: GainPair, motions: 
     files = ", ".join(Path(parse_cut(name)[0]).name for name in (*pair.unloaded, *pair.loaded))
     notes = (
         f"drive gains from {files} ({gains.scale}): {printed}",
-        f"gains and payload are estimated from {files}: no independent validation data; no σ of a parameter contains "
-        "that of the gains",
+        f"gains and payload are estimated from {files}, so these do not validate the model; the σ of parameters do not "
+        "contain the uncertainty of the gains",
         *_poor_gains(gains),
     )
     with_loads = replace(options, settings=replace(settings, payload_values=loads))
@@ -156,7 +169,8 @@ def _relative(chain: Chain, options: IdentifyOptions, currents: Sequence[tuple[s
         else:
             printed.append(f"{gain:.4g} ± {sigma:.2g}")
     notes = [
-        f"torques are {without_gains(unit)}; gains relative to it {', '.join(printed)}; for N m give gains, "
+        f"torques are {without_gains(unit)}; gains by joint, relative to that reference: {', '.join(printed)}; for N "
+        "m give gains, "
         "or [gain_identification] with a payload of known mass"
     ]
     if gains.own:
@@ -183,7 +197,7 @@ def _identify(
     base = find_base(model, cases, chain_states(chain, model, settings.seed))
     missing = [name for name in known_values if name not in [model.names[k] for k in base.kept]]
     if missing:
-        raise UsageError(f"'{missing[0]}' is not separately identifiable here; was the payload attached?")
+        raise UsageError(f"'{missing[0]}' is not separately identifiable from these runs; was the payload attached?")
     decimator = common_decimator(cases, settings)
     rows = with_blocks([observe(model, base.kept, case, decimator) for case in cases], settings.folds)
     tau = first_fit(rows)[1]
@@ -198,6 +212,13 @@ def _case(
     """Return a recording of currents as a `Case`.
 
     The recording is one of `motions`, or else a file in the folder of the options file.
+
+    Args:
+        name: name or path of the recording in the options.
+        chain: the arm.
+        options: options of the identification.
+        motions: path of a recording -> motion, for all recordings of the command.
+        carried: labels of the payloads that the arm carries.
 
     Raises:
         UsageError: if there is no such recording.

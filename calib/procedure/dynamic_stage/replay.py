@@ -61,8 +61,7 @@ def replay(
     controller: LoopController | None = None,
     rate: float | None = None,
 ) -> Replay:
-    """Return simulated tracking errors on a recorded motion with four feedforwards: none, CAD model, model, measured
-    torque.
+    """Return simulated tracking errors on a recorded motion with four kinds of feedforward torque.
 
     Args:
         chain: arm, with CAD inertias if its description has any.
@@ -109,7 +108,11 @@ def replay(
 
 
 def _stretch(case: Case) -> slice:
-    """Return the index range of the longest part of a recording without gaps, at most `MAX_SECONDS` long."""
+    """Return the index range of the longest part of a recording without gaps, at most `MAX_SECONDS` long.
+
+    Args:
+        case: the recording.
+    """
     first, last = max(segments(case.motion.segment), key=lambda ends: ends[1] - ends[0])
     return slice(first, min(last, first + int(MAX_SECONDS * case.motion.rate)))
 
@@ -118,6 +121,10 @@ def _robot(dynamics: Dynamics, case: Case) -> tuple[Plant, tuple[str, ...]]:
     """Return the model as a simulated robot with the recording's payloads, and the names of omitted terms.
 
     Drive terms that depend on neither velocity nor acceleration cannot be simulated and are omitted.
+
+    Args:
+        dynamics: the identified model.
+        case: the recording.
     """
     model = dynamics.model
     bodies, drives = dynamics.values[: model.inertial], dynamics.values[model.inertial :]
@@ -151,7 +158,8 @@ def _reference(part: Case, rate: float | None) -> tuple[Reference, float]:
 def _with_inertia(robot: Plant, reference: Reference) -> tuple[Plant, np.ndarray]:
     """Return the simulated robot with motor inertia added until M(q) is positive definite, and the added inertia (n,).
 
-    The smallest eigenvalue of M(q) along the reference, scaled by the diagonal of M(q), is raised to `MIN_EIGENVALUE`.
+    The smallest eigenvalue of the inertia matrix M(q) along the reference, scaled by the diagonal of M(q), is raised to
+    `MIN_EIGENVALUE`. The added inertia is in kg m² (prismatic joints: kg).
     """
     inertia = robot.inertia(reference.q[::50])
     diagonal = np.abs(np.einsum("kii->i", inertia)) / len(inertia)

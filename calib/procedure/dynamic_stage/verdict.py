@@ -50,7 +50,7 @@ class Resting:
 
     Attributes:
         names: names of these parameters.
-        of: number of all base parameters.
+        of: number of base parameters in total.
         source: source of the prior: ``cad`` or ``sizes``; empty: no prior.
     """
 
@@ -74,7 +74,8 @@ def judge(
 ) -> tuple[str, list[Finding]]:
     """Return a sentence on the torque errors on held-out motion, and the findings that worsen the verdict.
 
-    Recordings in which the robot hardly moves are ignored. The first finding is the worst of ``motion-poor``,
+    Recordings that the scores mark as no evidence, since the robot stands or nearly stands, are ignored. The first
+    finding is the worst of ``motion-poor``,
     ``torque-unexplained``, ``training-torque-unexplained`` and ``no-torque-transfer`` (on the error of all joints
     together; the first one if several are equally bad). Without usable held-out motion, the first findings state the
     training error and why there is no held-out motion. ``joints-unexplained`` follows, since a total hides joints with
@@ -159,6 +160,11 @@ def _joints(scores: Mapping[str, Score], rows: Sequence[str], coordinate: str) -
 
     The error is computed in the identification band, since noise is not a model error, and for moving joints only,
     since friction at rest can take any value.
+
+    Args:
+        scores: name of a held-out recording -> score.
+        rows: names of the torque rows; empty: 1, 2, ...
+        coordinate: noun for a torque row in messages, such as joint.
     """
     threshold = limit("joints-unexplained", "worst", "marginal")
     unexplained: dict[int, float] = {}
@@ -217,7 +223,12 @@ def extrapolates(name: str, expected: TorqueIntervals | None) -> list[Finding]:
 
 
 def with_prior(verdict: Verdict, rests: Resting) -> Verdict:
-    """Return the verdict, with a remark if a prior determines more than half of the parameters."""
+    """Return the verdict, with a remark if a prior determines more than half of the parameters.
+
+    Args:
+        verdict: the verdict.
+        rests: the parameters that the prior determines.
+    """
     if 2 * len(rests.names) <= rests.of:
         return verdict
     remark = finding("mostly-prior", count=len(rests.names), parameters=rests.of, source=rests.origin)
@@ -225,7 +236,7 @@ def with_prior(verdict: Verdict, rests: Resting) -> Verdict:
 
 
 def motion_findings(validation: Mapping[str, Score], repeated: Mapping[str, float]) -> list[Finding]:
-    """Return findings on held-out recordings that repeat the training motion, or in which the robot stands.
+    """Return findings on held-out recordings that repeat the training motion, or in which the robot does not move.
 
     Args:
         validation: name of a held-out recording -> score of the model.
@@ -239,12 +250,23 @@ def motion_findings(validation: Mapping[str, Score], repeated: Mapping[str, floa
 
 
 def excitation_notes(excitation: Mapping[str, ExcitationReport]) -> list[str]:
-    """Return remarks on what the training motions cannot identify, each beginning with the name of the recording."""
+    """Return remarks on parameters that the training motions cannot identify.
+
+    Each begins with the name of the recording.
+
+    Args:
+        excitation: name of a training recording -> report on its motion.
+    """
     return [f"{name}: {note}" for name, report in excitation.items() for note in report.notes]
 
 
 def model_findings(cases: Sequence[Case], identification: Identification) -> tuple[Finding, ...]:
-    """Return the findings on the model and its training motion that do not depend on held-out motion."""
+    """Return the findings on the model and its training motion that do not depend on held-out motion.
+
+    Args:
+        cases: training recordings.
+        identification: the identification.
+    """
     return (
         *parameter_findings(identification),
         *identification.loop.findings,
@@ -254,7 +276,11 @@ def model_findings(cases: Sequence[Case], identification: Identification) -> tup
 
 
 def parameter_findings(identification: Identification[RegressorModel]) -> tuple[Finding, ...]:
-    """Return findings on the parameters of any robot: condition number, bounds, signs, and prior."""
+    """Return findings on the parameters of any robot: condition number, bounds, signs, and prior.
+
+    Args:
+        identification: the identification.
+    """
     removed = []
     if identification.elimination is not None:
         steps = sorted(identification.elimination.steps, key=lambda step: -step.f)
@@ -282,7 +308,12 @@ def parameter_findings(identification: Identification[RegressorModel]) -> tuple[
 
 
 def beyond(case: Case, chain: Chain) -> list[Finding]:
-    """Return a finding on joints that move far beyond their limits in a recording; otherwise an empty list."""
+    """Return a finding on joints that move far beyond their limits in a recording; otherwise an empty list.
+
+    Args:
+        case: the recording.
+        chain: the arm with its joint limits.
+    """
     q = np.asarray(case.motion.q)
     excess = np.maximum(chain.lower - q.min(axis=0), q.max(axis=0) - chain.upper)
     tolerance = BEYOND * (chain.upper - chain.lower)
@@ -294,7 +325,11 @@ def beyond(case: Case, chain: Chain) -> list[Finding]:
 
 
 def resting_parameters(identification: Identification[RegressorModel]) -> Resting:
-    """Return the base parameters that are determined by the prior because the motion does not identify them."""
+    """Return the base parameters that are determined by the prior because the motion does not identify them.
+
+    Args:
+        identification: the identification with its prior.
+    """
     count, prior = identification.base.b, identification.prior
     if prior is None:
         return Resting(of=count)
@@ -304,7 +339,11 @@ def resting_parameters(identification: Identification[RegressorModel]) -> Restin
 
 
 def _negative(identification: Identification[RegressorModel]) -> list[Finding]:
-    """Return a finding on drive inertias and friction parameters that are negative by more than `SURELY` σ, if any."""
+    """Return a finding on drive inertias and friction parameters that are negative by more than `SURELY` σ, if any.
+
+    Args:
+        identification: the identification.
+    """
     estimate = identification.fitted.estimate
     names = []
     for name, term, value, sigma in zip(identification.names, identification.terms, estimate.values, estimate.sigma):
@@ -314,7 +353,11 @@ def _negative(identification: Identification[RegressorModel]) -> list[Finding]:
 
 
 def _payload_masses(identification: Identification[RegressorModel]) -> Iterable[Finding]:
-    """Yield findings on payloads whose identified mass is not positive, or not the stated one."""
+    """Yield findings on payloads whose identified mass is not positive, or not the stated one.
+
+    Args:
+        identification: the identification with identified payloads.
+    """
     estimate = identification.fitted.estimate
     masses = dict(zip(identification.base.names, zip(estimate.values, estimate.sigma)))
     for label, payload in identification.settings.payloads.items():
@@ -334,6 +377,9 @@ def _unmodelled(identification: Identification) -> list[Finding]:
     """Return a finding on joints with autocorrelated residuals, if any.
 
     The σ of these joints' parameters are valid for the recorded motion only.
+
+    Args:
+        identification: the identification.
     """
     inflation = np.nan_to_num(identification.fitted.inflation)
     rows = identification.settings.torque_rows.numbered(identification.dynamics.model.n)
@@ -343,7 +389,11 @@ def _unmodelled(identification: Identification) -> list[Finding]:
 
 
 def _elastic(cases: Sequence[Case]) -> Iterable[Finding]:
-    """Yield a finding for each recording with second encoders that show joint elasticity."""
+    """Yield a finding for each recording with second encoders that show joint elasticity.
+
+    Args:
+        cases: training recordings.
+    """
     for case in cases:
         if case.motion.q_link is None:
             continue

@@ -73,8 +73,9 @@ Numbers = Annotated[tuple[float, ...], Expect("a list of finite numbers")]
 
 @dataclass(frozen=True)
 class _JointTable:
-    """Entry ``[[joint]]`` of ``trajectory.toml``: coefficients of one joint; the module's docstring
-    explains the keys.
+    """Entry ``[[joint]]`` of ``trajectory.toml``: coefficients of one joint.
+
+    The module's docstring explains the keys.
     """
 
     name: Name
@@ -99,8 +100,7 @@ class TrajectoryFile:
 
 @dataclass(frozen=True, eq=False)
 class Periodic:
-    """A periodic motion, defined by the coefficients of a Fourier series (eq. 23 of Kolyubin et al. 2019) or of a
-    spline.
+    """A periodic motion, defined by the coefficients of a Fourier series or of a spline.
 
     Attributes:
         joint_names, kinds: (n,) names and kinds (revolute, prismatic) of the joints.
@@ -122,7 +122,7 @@ class Periodic:
     degree: int = 5
 
     def orders(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return positions, velocities and accelerations q, v, a, each (N, n), at N times [s]."""
+        """Return positions, velocities and accelerations q, v, a, each (N, n), at times (N,) [s]."""
         if self.kind == "fourier":
             q, v, a = (evaluate(self.coefficients, self.period, times, order) for order in range(3))
             return q, v, a
@@ -198,6 +198,10 @@ def read(folder: Path) -> Periodic:
 def _spline_points(content: TrajectoryFile, path: Path) -> list[np.ndarray]:
     """Return the control points of each joint's spline.
 
+    Args:
+        content: content of ``trajectory.toml``.
+        path: the file, for messages.
+
     Raises:
         UsageError: for a joint without control points.
     """
@@ -210,7 +214,15 @@ def _spline_points(content: TrajectoryFile, path: Path) -> list[np.ndarray]:
 
 
 def _fourier_coefficients(content: TrajectoryFile, path: Path) -> list[np.ndarray]:
-    """Return [q0, a, b] of each joint as one array, [q0] of a locked joint; refuse other numbers of harmonics."""
+    """Return [q0, a, b] of each joint as one array; only [q0] for a locked joint.
+
+    Args:
+        content: content of ``trajectory.toml``.
+        path: the file, for messages.
+
+    Raises:
+        UsageError: for a joint with another number of harmonics.
+    """
     count = max(len(joint.a or ()) for joint in content.joint)
     coefficients = []
     for number, joint in enumerate(content.joint, 1):
@@ -247,7 +259,12 @@ class AveragedMotion:
 
 
 def inputs(folder: Path, log: str) -> list[str | Path]:
-    """Return the files and folders that `find` reads, which no output may overwrite."""
+    """Return the files and folders that `find` reads, which no output may overwrite.
+
+    Args:
+        folder: folder of the designed motion.
+        log: the recording.
+    """
     return [folder, folder / NAME, folder / METRICS, log]
 
 
@@ -287,7 +304,12 @@ def find(folder: Path, log: str, skip: int = 0) -> AveragedMotion:
 
 
 def write(averaged: AveragedMotion, out: Path) -> Path:
-    """Write one averaged period as a recording: CSV, or a NumPy archive that also contains the variances."""
+    """Write one averaged period as a recording, and return the path.
+
+    Args:
+        averaged: the averaged motion.
+        out: a CSV file, or a NumPy archive, which also contains the variances.
+    """
     averages, motion = averaged.averages, averaged.motion
     letters = HEADERS | {"q": "q", "v": "v", "effort": "tau" if averaged.kind == "torque" else "current"}
     t = np.arange(averaged.found.period) / averaged.rate
@@ -310,7 +332,11 @@ def write(averaged: AveragedMotion, out: Path) -> Path:
 
 
 def lines(averaged: AveragedMotion) -> list[str]:
-    """Return the lines that `calib recall` prints: number of periods, their agreement, and noise of each joint."""
+    """Return the lines that `calib recall` prints: number of periods, their agreement, and noise of each joint.
+
+    Args:
+        averaged: the averaged motion.
+    """
     recalled, averages, motion = averaged.found, averaged.averages, averaged.motion
     start = recalled.start / averaged.rate
     unit = motion_units(motion.kinds)[0]
@@ -332,7 +358,11 @@ def lines(averaged: AveragedMotion) -> list[str]:
 def _longest(recording: Recording, period: float) -> tuple[float, dict[str, np.ndarray]]:
     """Return sampling rate [Hz] and series of a recording's longest part without gaps.
 
-    The recording is resampled so that the period [s] has a whole number of samples.
+    The recording is resampled so that one period of the motion has a whole number of samples.
+
+    Args:
+        recording: the recording.
+        period: period of the motion [s].
     """
     recorded_rate = 1.0 / float(np.median(np.diff(recording.t)))
     rate = max(1, round(period * recorded_rate)) / period

@@ -56,8 +56,9 @@ class DesignCondition:
     normalised_before: float | None = None
 
     def table(self) -> dict[str, float]:
-        """Return the entry ``condition_number`` of ``metrics.json``: name of a condition number ->
-        value, without None.
+        """Return the entry ``condition_number`` of ``metrics.json``: name of a condition number -> value.
+
+        Values that are None are omitted.
         """
         return {name: value for name, value in asdict(self).items() if value is not None}
 
@@ -89,8 +90,9 @@ class Designed:
         stored_front: the front with its motions, as the folder keeps it; None without a front.
         playback: setpoints for the controller.
         notes: remarks for the user.
-        doubts: those of the remarks that are on goals: missed, or decided by typical friction.
-        outlook: prediction of what the motion identifies; None without torque limits, from which torque errors are
+        doubts: those `notes` that are on goals which are missed, or whose value depends on assumed typical friction.
+        outlook: predicted accuracy of the parameters and torques that the motion identifies; None without torque
+            limits, from which torque errors are
             assumed.
         predicted: predicted σ of the parameters; empty without `outlook`.
     """
@@ -149,18 +151,21 @@ def excite(
     Without goals, the logarithms of both condition numbers, raw and normalised, are minimised with equal weights; an
     aim such as ``logdet`` replaces them. With goals (``wrist=0.1``), the condition numbers become goals, too. Unless
     the settings state their goal values, these are the values reached in a first search for the condition numbers alone
-    (as the study advises).
+    (as Kolyubin et al. 2019 advise).
 
     Ctrl-C ends the search; the best motion found until then is verified and returned.
 
     Args:
-        robot, base, tip: see `calib.robot.library`.
-        settings: see `calib.procedure.excitation.settings`.
-        model: folder of an identification: torques, friction and their uncertainty.
-        limits: see `calib.procedure.excitation.limits`.
-        options: options of the identification that will follow: torque rows, drive terms, payloads.
-        after: folder of an identification whose recordings the motion shall complement; replaces `model`.
-        picked: front of an earlier design with the same settings, whose designed motion is taken instead of a search.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
+        settings: goals, period, family of motions, search and playback.
+        model: folder of an identification, from which torques, friction and their uncertainty are taken; None: no
+            identification.
+        limits: limits file (`calib formats limits`), or its content as tables; None: limits of the robot's description.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
+        options: options of the identification that will follow (torque rows, drive terms, payloads); None: defaults.
+        after: folder of an identification whose recordings the motion shall complement; replaces `model`; None: none.
+        picked: front of an earlier design with the same settings, whose designed motion is taken instead of a search;
+            None: search.
         map: function that runs the starts of the search, possibly in parallel (`calib.workers`).
         progress: called with a text on each step; None: silent.
 
@@ -176,7 +181,7 @@ def excite(
 
 
 def _silent(stage: str) -> None:
-    """Ignore a progress text."""
+    """Ignore a progress text, `stage`."""
 
 
 def search_motion(
@@ -188,7 +193,13 @@ def search_motion(
 ) -> Designed:
     """Search for an exciting motion of an arm, or, for a parallel robot, of the platform's coordinates.
 
-    With `picked`, the designed motion of an earlier front is verified and taken instead.
+    Args:
+        inputs: robot, model, limits and earlier motions.
+        settings: settings of the design.
+        map: function that runs the starts of the search, possibly in parallel.
+        progress: called with a text on each step; None: silent.
+        picked: front of an earlier design, whose designed motion is verified and taken instead of a search; None:
+            search.
     """
     show = progress or _silent
 
@@ -262,7 +273,14 @@ def search_motion(
 def _picked(
     problem: ExcitationProblem, goals: Sequence[AttainmentGoal], front: StoredFront, inputs: ExcitationInputs
 ) -> tuple[SearchResult, ExcitationProblem]:
-    """Return the designed motion of a front, and the problem with the goals."""
+    """Return the designed motion of a front, and the problem with the goals.
+
+    Args:
+        problem: the optimisation problem.
+        goals: the goals; empty: none.
+        front: front of an earlier design with the same settings.
+        inputs: robot and model.
+    """
     joint_names, chain = front.designed.joint_names, inputs.chain
     if joint_names != chain.joint_names:
         joints, expected = ", ".join(joint_names), ", ".join(chain.joint_names)
@@ -276,7 +294,14 @@ def _picked(
 
 
 def _periodic(motion: SearchResult, inputs: ExcitationInputs, settings: ExcitationSettings, family: Family) -> Periodic:
-    """Return a result of the search as a periodic motion."""
+    """Return a result of the search as a periodic motion.
+
+    Args:
+        motion: the result of the search.
+        inputs: the robot, which names the joints.
+        settings: settings of the design, with the controller's rate.
+        family: family of motions of the search.
+    """
     return Periodic(
         joint_names=inputs.chain.joint_names,
         kinds=tuple(joint.kind for joint in inputs.chain.joints),
@@ -295,6 +320,12 @@ def _reached(
     """Return the value of each goal that a motion reaches at `INSTANTS` samples.
 
     Coulomb friction is not smoothed additionally.
+
+    Args:
+        problem: the optimisation problem.
+        goals: the goals.
+        result: the motion.
+        inputs: robot and model.
     """
     if not goals:
         return ()
@@ -320,6 +351,10 @@ def _excitation_problem(
     inputs: ExcitationInputs, settings: ExcitationSettings
 ) -> tuple[ExcitationProblem, tuple[MotionConstraint, ...], tuple[str, ...]]:
     """Return the optimisation problem of a design, the constraints for its verification, and notes for the user.
+
+    Args:
+        inputs: robot, model, limits and earlier motions.
+        settings: settings of the design.
 
     Raises:
         UsageError: for a shortest period above the period.
@@ -350,6 +385,8 @@ def _with_whole_samples(
     """Return motion and problem with the period increased to a whole number of controller samples.
 
     Args:
+        motion: result of the search.
+        problem: the optimisation problem.
         rate: rate of the controller [Hz].
     """
     if not problem.free_period:
@@ -360,7 +397,12 @@ def _with_whole_samples(
 
 
 def _condition_objective(inputs: ExcitationInputs, settings: ExcitationSettings) -> Excitation:
-    """Return the condition number of the identifiable columns as an objective, including earlier motions."""
+    """Return the condition number of the identifiable columns as an objective, including earlier motions.
+
+    Args:
+        inputs: robot, model and earlier motions.
+        settings: settings of the design.
+    """
     existing = None
     if inputs.prior is not None:
         existing = inputs.prior.per_sample(settings.samples, settings.repeat * settings.period)
@@ -375,6 +417,13 @@ def _searched(
 
     If there are goals, but none for the condition numbers, a first search without goals determines the goal values of
     the condition numbers.
+
+    Args:
+        problem: the optimisation problem.
+        goals: the goals; empty: none.
+        starts: number of random starts.
+        search: function that searches for the best motion of a problem.
+        show: called with a text on each step.
     """
     has_condition_goal = any(isinstance(goal.objective, Excitation) for goal in goals)
     if not goals or has_condition_goal:
@@ -437,6 +486,10 @@ def _family(inputs: ExcitationInputs, settings: ExcitationSettings) -> tuple[Fam
 
     The second family is None for splines, or if the first has few harmonics.
 
+    Args:
+        inputs: robot, limits and locked joints.
+        settings: settings of the design.
+
     Raises:
         UsageError: for an unknown family.
     """
@@ -467,6 +520,10 @@ def _constraints(
     """Return the constraints for the search, the constraints for the verification, and notes for the user.
 
     Constraints for the verification use the sign function of Coulomb friction without additional smoothing.
+
+    Args:
+        dynamics: the model to excite, with known values if torques are to be limited.
+        limits: limits of the motion.
     """
     values = dynamics.values
     if values is None or not np.isfinite(limits.torque).any():
@@ -507,6 +564,14 @@ def _nearest_goals(
     """Return the front, and the motion nearest to the goals with its verified margins.
 
     Candidates are the designed motion and the motions of the front. Without goals, the designed motion is returned.
+
+    Args:
+        front: the front.
+        problem: the optimisation problem.
+        goals: the goals; empty: none.
+        inputs: robot and model.
+        designed: the designed motion and its verified margins.
+        checked: constraints for the verification.
     """
 
     def distance(motion: SearchResult) -> float:
@@ -537,6 +602,15 @@ def _front(
 
     The torque goal is varied from its value at rest to its best value. It is the first torque goal in the settings
     (default: wrist). The condition number is the first one among the goals (default: the normalised one, or the aim).
+
+    Args:
+        problem: the optimisation problem.
+        inputs: robot and model.
+        motion: the designed motion, which is added to the front.
+        goals: the goals.
+        count: number of trade-offs.
+        evaluations: largest number of evaluations of each search.
+        report: called with the number of searches done, their total, and a sentence.
     """
     slacks = [goal.objective for goal in goals if isinstance(goal.objective, TorqueSlack)]
     slack = slacks[0] if slacks else torque_slack(wrist(inputs.chain.n), inputs, "front")

@@ -65,17 +65,18 @@ def read_model(
     loads: Sequence[str] = (),
     nominal: Chain | None = None,
 ) -> ExcitedModel:
-    """Return the model to excite: from an identification's folder, or from the robot's inertias and the stated
-    friction.
+    """Return the model to excite, of an identification, or of the robot's inertias and the stated friction.
 
     Args:
         chain: the arm.
         folder: folder of an identification, whose torque rows are used; None: no identification.
-        sets: drive terms of motor torques, used without folder and options; empty: default terms.
+        sets: names of drive terms of motor torques (``Ia Fv Fc off``), used without folder and options; empty: default
+            terms.
         limits: limits of the motion, with the friction that the limits file states.
         options: options of the later identification, allowed only without a folder; None: defaults.
-        loads: payloads of each run, see `ExcitationSettings`.
-        nominal: arm on which base columns are selected, see `excited_model`; None: `chain`.
+        loads: payloads of each run: ``none``, or labels joined by ``+``; empty: one run without, and one with each
+            payload.
+        nominal: arm on whose geometry the base parameters are selected, as in the identification; None: `chain`.
 
     Raises:
         UsageError: for an unknown payload, or if both folder and options are given.
@@ -101,7 +102,9 @@ def read_model(
     model, derivative_notes = _differentiable(model)
     cases = loads_of(loads, payloads, with_payloads=True)
     if options is not None and options.friction not in ("auto", "standard"):
-        notes.append(f"designed for standard friction: the step '{options.friction}' has its terms from recordings")
+        notes.append(
+            f"designed for standard friction, since the terms of '{options.friction}' are chosen from recordings"
+        )
     if chain.inertias is None and np.isfinite(limits.torque).any():
         sizes = ", ".join(f"{size:g}" for size in dict.fromkeys(limits.torque.tolist()))
         notes.append(f"NOT checked: torques (limits {sizes}), since the robot has no masses; name a model (--model)")
@@ -132,6 +135,10 @@ def read_model(
 
 def check_held(model: ExcitedModel, limits: MotionLimits) -> None:
     """Check that the torque limits suffice against gravity in at least half of the postures.
+
+    Args:
+        model: the model that predicts gravity torques.
+        limits: limits of the motion with the torque limits.
 
     Raises:
         UsageError: if they do not, since the payload is too heavy, or the masses or limits are wrong.
@@ -168,6 +175,9 @@ def stated_payloads(options: IdentificationSettings | None) -> tuple[list[tuple[
     """Return the ten inertial parameters of each payload in the options, and notes on assumptions about the payloads.
 
     The parameters are zero for a payload without a stated mass.
+
+    Args:
+        options: options of the later identification; None: no payloads.
     """
     parameters: list[tuple[float, ...]] = []
     notes: list[str] = []
@@ -207,7 +217,11 @@ def loads_of(texts: Sequence[str], payloads: Sequence[str], with_payloads: bool)
             labels = tuple(part.strip() for part in text.split("+"))
         for label in labels:
             where = f"load '{text}': payload"
-            require(payloads, f"{where} '{label}' is not known: options or model have no payloads", UsageError)
+            require(
+                payloads,
+                f"{where} '{label}' is not known, since options or model have no payloads: leave it out",
+                UsageError,
+            )
             one_of(label, payloads, where, UsageError)
         runs.append(labels)
     return tuple(runs)
@@ -229,11 +243,11 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str], nominal: Chain
     Args:
         chain: the arm.
         folder: folder of the identification.
-        texts: payloads of each run, see `loads_of`.
-        nominal: arm on which base columns are selected; None: `chain`.
+        texts: payloads of each run: ``none``, or labels joined by ``+``.
+        nominal: arm on whose geometry the base parameters are selected; None: `chain`.
 
     Raises:
-        UsageError: if the identification does not fit the arm or the design.
+        UsageError: if the identification belongs to another arm, or its torque rows are not suited for a design.
     """
     refuse_currents(folder, "an excitation within torque limits")
     refuse_other_arm(folder, chain)
@@ -256,7 +270,7 @@ def _identified(chain: Chain, folder: Path, texts: Sequence[str], nominal: Chain
     parameters = np.array([value_of[name] for name in model.names])
     if not np.isfinite(parameters).all():
         name = model.names[int(np.argmin(np.isfinite(parameters)))]
-        raise UsageError(f"{folder}: parameter {name} of the model is not finite")
+        raise UsageError(f"{folder}: parameter {name} of the model is not finite; identify again")
     friction = any(term.shape == "sign" for term in model.columns)
     excited = excited_model(model, loads, parameters, friction, notes, nominal)
     covariance = covariance_of(folder / COVARIANCE, excited.exact)
@@ -280,7 +294,12 @@ def bodies_with(chain: Chain, gravity: np.ndarray, payloads: Sequence[str]) -> B
 
 
 def moved_to(chain: Chain, model: IdentificationModel) -> IdentificationModel:
-    """Return a model, including its payloads, on another geometry of the arm."""
+    """Return a model, including its payloads, with the geometry of another arm.
+
+    Args:
+        chain: the arm.
+        model: the model.
+    """
     return replace(model, bodies=bodies_with(chain, model.bodies.gravity, _payloads(model)))
 
 
@@ -325,7 +344,10 @@ def excited_model(
     identifiable = {model.names[k].removeprefix(name) for k in base.kept for name in STANDARD}
     lost = [label for label in _payloads(model) if label not in identifiable]
     if lost:
-        notes = (*notes, f"payload {', '.join(lost)}: not identifiable from these loads; run others, too: --load none")
+        notes = (
+            *notes,
+            f"payload {', '.join(lost)}: not identifiable from these loads; add another load, such as --load none",
+        )
     return ExcitedModel(
         smooth=LoadCases(smooth, base, loads),
         exact=LoadCases(model, base, loads),
@@ -340,6 +362,10 @@ def covariance_of(path: Path, model: LoadCases) -> np.ndarray | None:
     """Return the covariance (b, b) of a model's base columns, read from a file.
 
     None if the file is missing or contains other columns.
+
+    Args:
+        path: the CSV file.
+        model: the model with its base columns.
     """
     names: Sequence[str] = ()
     covariance = np.empty((0, 0))

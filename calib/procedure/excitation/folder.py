@@ -128,7 +128,13 @@ def write_plan(planned: Planned, out: Path, draw: Callable[[Planned, Path], None
 
 
 def _write_arm(chain: Chain, source: str, folder: Path) -> None:
-    """Write a description of the robot for which a motion was made, with the name of the original description."""
+    """Write a description of the robot for which a motion was made, with the name of the original description.
+
+    Args:
+        chain: the robot.
+        source: name of the original description.
+        folder: folder to write into.
+    """
     description.write(folder / coefficients.ARM, chain, {"provenance": {"robot": source}})
 
 
@@ -136,6 +142,11 @@ def _write_setpoints(track: Setpoints, bounds: MotionBounds, path: Path) -> Path
     """Write time, position, velocity, acceleration and, if known, torque, one row per controller sample.
 
     Comments at the head of the file state the limits.
+
+    Args:
+        track: the setpoints.
+        bounds: limits of the motion.
+        path: the CSV file.
     """
     bounds.check(track)
     columns = {"q": track.q, "v": track.v, "a": track.a}
@@ -149,8 +160,12 @@ def _write_setpoints(track: Setpoints, bounds: MotionBounds, path: Path) -> Path
 
 
 def _write_approach_and_rehearsal(motion: Playback | Planned, bounds: MotionBounds, folder: Path) -> None:
-    """Write the setpoints of approach and rehearsal, if the motion has them, as ``approach.csv``
-    and ``rehearsal.csv``.
+    """Write the setpoints of approach and rehearsal, if the motion has them.
+
+    Args:
+        motion: the motion.
+        bounds: its limits, for the comments in the files.
+        folder: folder for ``approach.csv`` and ``rehearsal.csv``.
     """
     if motion.approach is not None:
         _write_setpoints(motion.approach, bounds, folder / APPROACH)
@@ -159,7 +174,14 @@ def _write_approach_and_rehearsal(motion: Playback | Planned, bounds: MotionBoun
 
 
 def _write_messages(track: Setpoints, bounds: MotionBounds, folder: Path, step: int = 1) -> None:
-    """Write every `step`-th sample as trajectory_msgs/JointTrajectory: ``trajectory.json`` and ``trajectory.yaml``."""
+    """Write a motion as trajectory_msgs/JointTrajectory: ``trajectory.json`` and ``trajectory.yaml``.
+
+    Args:
+        track: the setpoints.
+        bounds: limits of the motion, for the comments in the files.
+        folder: folder to write into.
+        step: number of samples from one point of the message to the next.
+    """
     bounds.check(track)
     message = joint_trajectory(track, [joint.name for joint in bounds.joints], step)
     # JSON has no remarks
@@ -246,7 +268,11 @@ def _condition_text(raw: float | None, normalised: float | None) -> str:
 
 
 def design_lines(designed: Designed) -> list[str]:
-    """Return the lines that `calib excite` prints: condition numbers, reached goals, margins, limits, and notes."""
+    """Return the lines that `calib excite` prints: condition numbers, reached goals, margins, limits, and notes.
+
+    Args:
+        designed: the motion.
+    """
     motion, condition, proof, playback = designed.found, designed.condition, designed.proof, designed.playback
     column_count = len(designed.inputs.columns.aimed_names)
     prior = designed.inputs.prior
@@ -333,7 +359,11 @@ def plan_metrics(planned: Planned) -> dict[str, object]:
 
 
 def plan_lines(planned: Planned) -> list[str]:
-    """Return the lines that `calib plan` prints: duration, margins, limits, and notes."""
+    """Return the lines that `calib plan` prints: duration, margins, limits, and notes.
+
+    Args:
+        planned: the motion.
+    """
     lines = [
         f"{planned.track.duration:.3f} s at {planned.track.rate:g} Hz; closer than {ACTIVE:.0%} to a limit for "
         f"{planned.active_share:.1%} of the time; all limits are respected at "
@@ -376,7 +406,7 @@ def _verified(planned: Planned) -> int:
 
 
 def _margins(planned: Planned) -> dict[str, _PlanMargin]:
-    """Return the smallest margin to each limit: name of the limit -> margin."""
+    """Return the smallest margin of a planned motion to each limit: name of the limit -> margin."""
     result = {}
     if planned.margins is not None:
         j = int(np.argmin(planned.margins))

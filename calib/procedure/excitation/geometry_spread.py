@@ -17,19 +17,23 @@ from calib.robot.chain import Chain
 
 @dataclass(frozen=True, eq=False)
 class GeometrySpread:
-    """Principal errors g_i of a geometry, see `calib.procedure.excitation.prior_motions.PrincipalErrors`.
+    """Principal errors g_i of a geometry, and the models with the geometry changed by them.
+
+    `calib.procedure.excitation.prior_motions.PrincipalErrors` explains principal errors.
 
     Attributes:
         moved: r pairs of models, with the geometry changed by +g_i and by -g_i.
-        before: (b, r) shifts S g_i of the base parameters of an earlier identification; zero without an earlier
-            identification.
+        before: (b, r) shifts S g_i of the base parameters of an earlier identification, with S their sensitivity to the
+            geometry; zero without an earlier identification.
     """
 
     moved: tuple[tuple[LoadCases, LoadCases], ...]
     before: np.ndarray
 
     def felt(self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the changes (N, rows, r) of the torques by each of r principal errors, at constant base parameters.
+        """Return the changes (N, rows, r) of the torques [N m or N] by each of r principal errors.
+
+        The base parameters are constant.
 
         Args:
             values: (b,) base parameters.

@@ -40,7 +40,8 @@ def objectives_of(
 
     Args:
         settings: settings of the design.
-        condition: condition number as an objective, from which the others are derived, see `read_goals`.
+        condition: condition number as an objective, with the columns, rows and earlier information of the design; the
+            other objectives are derived from it.
         inputs: robot and model; without goals, the aim is ``logdet`` if an identification states torque errors.
 
     Raises:
@@ -143,6 +144,13 @@ def _objective(
 ) -> tuple[Objective, float]:
     """Return the objective with a goal's name, and the value that it has to reach.
 
+    Args:
+        name: name of the goal, such as ``raw``, ``wrist`` or ``coverage``.
+        value: stated value of the goal.
+        inputs: robot and model.
+        condition: condition number as an objective.
+        shortest: shortest allowed period [s]; None: the period is fixed.
+
     Raises:
         UsageError: for an unknown name, an invalid value, or missing inputs.
     """
@@ -198,6 +206,9 @@ def _typical_friction(inputs: ExcitationInputs) -> np.ndarray:
     """Return standard parameters (p,) of typical friction, all others zero.
 
     At full speed, the friction torques are the shares `TYPICAL` of the torque limits.
+
+    Args:
+        inputs: robot and model with torque limits.
     """
     limits, model = inputs.limits, inputs.model.exact.model
     # the values at which a term's torque is the joint's limit

@@ -31,7 +31,7 @@ class IdentifiableColumns:
 
     Attributes:
         columns: (c,) indices of the identifiable columns among the model's base columns; None: all columns.
-        sigmas: (rows,) σ by which torque rows are divided, see `PriorMotions`; infinite: excluded rows; None: 1.
+        sigmas: (rows,) standard deviations by which torque rows are divided; infinite: excluded rows; None: 1.
         names: names of the identifiable columns.
         notes: remarks for the user.
         chosen: (k,) indices of the columns for which the motion is designed, although all identifiable columns are
@@ -109,11 +109,12 @@ def read_inputs(
     """Return the inputs of an excitation: robot, limits, model and earlier motions, read from their files.
 
     Args:
-        robot, base, tip: see `calib.robot.library`.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
         settings: settings of the design.
         model: folder of an identification, from which torques, friction and their uncertainty are taken; None: from the
             robot's description.
-        limits: see `calib.procedure.excitation.limits`; None: limits of the robot's description.
+        limits: limits file (`calib formats limits`), or its content as tables; None: limits of the robot's description.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
         options: options of the later identification: torque rows, drive terms, payloads; None: defaults.
         after: folder of an identification whose recordings the motion shall complement; it replaces `model`, and its
             information and torque errors are used; None: none.
@@ -125,7 +126,7 @@ def read_inputs(
     model = model or after
     if settings.drives and (model is not None or options is not None):
         raise UsageError(
-            f"drives '{settings.drives}': {model or 'the options file'} states the drive terms; leave it out"
+            f"drives '{settings.drives}': {model or 'the options file'} states the drive terms; leave drives out"
         )
     calibrated, source = load_rigid(robot, None, base, tip)
     chain = calibrated.chain

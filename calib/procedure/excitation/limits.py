@@ -49,8 +49,8 @@ from calib.robot.kinematics import joint_frames, joint_jacobian, sweep
 from calib.trajectories.basis import SampledMotion
 from calib.trajectories.constraints import BoxLimit, MotionConstraint, box_limits
 from calib.trajectories.errors import NothingFeasible
-from calib.trajectories.places import Clearance, Workspace
 from calib.trajectories.setpoints import Setpoints
+from calib.trajectories.workspace_limits import Clearance, Workspace
 from calib.units import motion_units
 
 # [rad or m, s, N m or N] a number above is no limit of a joint; direct drives of fast robots reach 1300 (our choice)
@@ -78,7 +78,7 @@ STATED_IN = {
     "workspace": "[target] (height, axis_distance) and [[point]]",
     "clearance": "[collision] (margin, radius, floor) and [[obstacle]]",
 }
-# constraints of pose selection that `trajectories.places.Workspace` keeps
+# constraints of pose selection that `trajectories.workspace_limits.Workspace` keeps
 OF_WORKSPACE = ("height", "distance from the axis")
 
 
@@ -112,7 +112,7 @@ class MotionBounds:
             "acceleration",
             {"acceleration": self.acceleration, "effort": self.torque},
             "acceleration",
-            "; efforts count where masses are known or a model is named (--model)",
+            "; limits of effort are used only where masses are known or a model is named (--model)",
         )
 
     def _require(self, example: str, limits: Mapping[str, np.ndarray], quantity: str, hint: str) -> None:
@@ -138,7 +138,7 @@ class MotionBounds:
         for kind, sizes in limits.items():
             numbers += [f"{kind} {size:g}" for size in sizes[unlimited] if np.isfinite(size)]
         wrong = [number for number in dict.fromkeys(numbers) if number.split()[0] in limits]
-        remark = f" ({', '.join(wrong)} is no limit)" if wrong else ""
+        remark = f" ({', '.join(wrong)} is not a limit)" if wrong else ""
         raise UsageError(
             f"{self.robot}: no limit for the {quantity} of {self._named(joints)}{remark}; without it no motion "
             f"is written; state it {self.place.format(EXAMPLES[example])}{hint}"
@@ -174,6 +174,9 @@ class MotionBounds:
         `MAX` is a value that no real joint reaches. It matters if light links and high torque limits would allow
         accelerations that no robot reaches.
 
+        Args:
+            track: the setpoints.
+
         Raises:
             UsageError: for a violated limit; the message names the joint and the limit.
         """
@@ -181,7 +184,13 @@ class MotionBounds:
         self._check("acceleration", np.abs(track.a).max(axis=0), self.acceleration)
 
     def _check(self, kind: str, peak: np.ndarray, limit: np.ndarray) -> None:
-        """Raise a UsageError if the largest velocity or acceleration (n,) of a joint exceeds its limit (n,)."""
+        """Raise a UsageError if the velocity or acceleration of a joint exceeds its limit.
+
+        Args:
+            kind: ``velocity`` or ``acceleration``.
+            peak: (n,) largest values of the motion.
+            limit: (n,) limits.
+        """
         limit = np.minimum(limit, MAX[kind])
         j = int(np.argmax(peak / limit))
         if not peak[j] <= (1.0 + MAX_EXCESS) * limit[j]:
@@ -286,6 +295,9 @@ class MotionLimits:
         """Yield each violated constraint with a message and the index of the worst of N sampled states.
 
         Joint limits are not checked.
+
+        Args:
+            motion: N sampled states of the motion.
         """
         for limit in self.constraints:
             if isinstance(limit, BoxLimit):
@@ -365,7 +377,7 @@ def read_motion_limits(
         pairs = tuple(f"{link} - {obstacle}" for link, obstacle in collision.pairs)
         constraints.append(Clearance(collision.distances, collision.gradients, pairs, pose_limits.clearance))
         if pose_limits.checked:
-            notes.append(f"kept: {', '.join(pose_limits.checked)}")
+            notes.append(f"respected: {', '.join(pose_limits.checked)}")
         if pose_limits.unchecked:
             notes.append(f"NOT checked: {', '.join(pose_limits.unchecked)}")
     return MotionLimits(
@@ -437,7 +449,13 @@ def _bounds(
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Named points of links: function of joint values q (N, n) with positions (N, k, 3) [m] in the base frame."""
+    """Named points of links: function of joint values q (N, n) with positions (N, k, 3) [m] in the base frame.
+
+    Attributes:
+        chain: the arm.
+        joints: for each of k points, the number (from 1) of the joint behind which it is fixed; 0: fixed to the tip.
+        places: (k, 3) coordinates of the points in the frames behind these joints [m].
+    """
 
     chain: Chain
     joints: tuple[int, ...]
@@ -447,7 +465,7 @@ class Points:
         return self._positions(q, sweep(self.chain, q).poses())
 
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-        """Return the gradient (N, n) of Σ G · points with respect to q, for weights G (N, k, 3)."""
+        """Return the gradient (N, n) of Σ G · points with respect to q (N, n), for weights G (N, k, 3)."""
         kinematics = sweep(self.chain, q)
         points = self._positions(q, kinematics.poses())
         gradient = np.zeros(q.shape)
@@ -473,7 +491,16 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class _PoseLimit:
-    """A constraint of pose selection that is applied to each sampled posture of a motion."""
+    """A constraint of pose selection that is applied to each sampled posture of a motion.
+
+    Attributes:
+        of: the constraint, with k values per posture.
+        name: its name in messages.
+        labels: (k,) names of the values.
+        scale: (k,) numbers [unit] by which values are divided to compare different constraints.
+        groups: (k,) group number of each value; the optimiser gets one smooth function per group.
+        unit: unit of the values.
+    """
 
     of: PoseConstraint
     name: str
@@ -494,7 +521,13 @@ class _PoseLimit:
 
 
 def _position_constraints(settings: LimitsFile, pose_limits: Limits, points: Points) -> list[MotionConstraint]:
-    """Return constraints on the workspace of tip and named points, and all other constraints of pose selection."""
+    """Return constraints on the workspace of tip and named points, and all other constraints of pose selection.
+
+    Args:
+        settings: content of the limits file.
+        pose_limits: limits of pose selection.
+        points: the named points.
+    """
     constraints: list[MotionConstraint] = []
     radius = settings.target.axis_distance
     lowest, highest = settings.target.heights
@@ -568,6 +601,8 @@ def _friction(table: FrictionTable | None, chain: Chain, where: str) -> np.ndarr
     for key, coefficients in (("Fv", table.Fv), ("Fc", table.Fc)):
         joint_values = coefficients or (0.0,) * chain.n
         if len(joint_values) not in (1, chain.n):
-            raise UsageError(f"{where}: friction.{key}: {len(joint_values)} values for {chain.n} joints")
+            raise UsageError(
+                f"{where}: friction.{key}: {len(joint_values)} values for {chain.n} joints: state one per joint"
+            )
         result.append(np.broadcast_to(np.array(joint_values), (chain.n,)))
     return np.array(result)

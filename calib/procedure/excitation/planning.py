@@ -209,7 +209,7 @@ class Planned:
 
 
 def _silent(stage: str) -> None:
-    """Ignore a progress text."""
+    """Ignore a progress text, `stage`."""
 
 
 def plan(
@@ -227,13 +227,15 @@ def plan(
     """Return the fastest motion of a robot through waypoints, within its limits.
 
     Args:
-        robot, base, tip: see `calib.robot.library`.
-        waypoints: see `calib.procedure.excitation.planning`.
-        settings: see `calib.procedure.excitation.settings`.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
+        waypoints: CSV file of joint values or tool poses; or in memory joint values (m, n) [rad or m], poses (m, 4, 4)
+            [m], or targets.
+        settings: payloads, straight lines, rate, start, and optimisation of the path's shape.
         model: folder of an identification, whose geometry and torques are used; the limits are those of the robot;
             None: masses of the robot's description.
-        limits: see `calib.procedure.excitation.limits`; None: limits of the robot's description.
-        drives: drive parameters, see `_read_drives`; None: unknown.
+        limits: limits file (`calib formats limits`), or its content as tables; None: limits of the robot's description.
+        drives: TOML file with a table ``[drives]`` of Ia, Fv, Fc, off per joint, or its tables; None: unknown.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
         progress: called with a text on each step; None: silent.
 
     Raises:
@@ -302,7 +304,12 @@ def plan(
 
 
 def _check_request(settings: PlanSettings, model: Path | None) -> None:
-    """Raise a UsageError if settings contradict each other."""
+    """Raise a UsageError if settings contradict each other, or need an identified model that is not given.
+
+    Args:
+        settings: settings of the plan.
+        model: folder of an identification; None: no model.
+    """
     if settings.shorten and settings.lines:
         raise UsageError(
             "--shorten cannot be combined with --line: straight lines leave no path to change; leave one out"
@@ -319,7 +326,16 @@ def _shortened(
     dynamics: PathDynamics | None,
     show: Progress,
 ) -> Shaped:
-    """Return the path through the waypoints (m, n) whose shape allows the shortest duration within all limits."""
+    """Return the path through the waypoints whose shape allows the shortest duration within all limits.
+
+    Args:
+        points: (m, n) waypoints [rad or m].
+        settings: number of timings, and largest deviation of the path from the spline.
+        motion_limits: joint limits, workspace and clearance.
+        timing_limits: limits of velocity, acceleration and torque.
+        dynamics: the robot's dynamics; None: no torque limits.
+        show: called with a text on the progress.
+    """
     positions = motion_limits.positions
 
     def duration(path: JointPath) -> float:
@@ -334,7 +350,12 @@ def _shortened(
 
 
 def _read_drives(tables: Tables | None, chain: Chain) -> dict[str, np.ndarray]:
-    """Return drive parameters (n,) by name, from TOML: table ``[drives]`` with Ia, Fv, Fc, off (SI, joint side)."""
+    """Return drive parameters (n,) by name, from the table ``[drives]`` with Ia, Fv, Fc, off (SI, joint side).
+
+    Args:
+        tables: TOML file, or its tables; None: no parameters are stated, and the result is empty.
+        chain: the arm with n joints.
+    """
     content, where = read(_DrivesFile, tables, "drives")
     check_keys(content.drives, DRIVES, f"{where}: drives")
     drives = {}
@@ -403,6 +424,11 @@ def _dynamics(
 def _identified(chain: Chain, folder: Path, payloads: Sequence[str]) -> tuple[PathDynamics, Uncertainty | None]:
     """Return the dynamics of an identified model with payloads, and its uncertainty (None without a covariance).
 
+    Args:
+        chain: the arm.
+        folder: folder of the identification.
+        payloads: labels of the attached payloads.
+
     Raises:
         UsageError: for an unknown payload, or an identification of another arm.
     """
@@ -432,7 +458,9 @@ def _guarded(limits: TimingLimits, margin: np.ndarray, chain: Chain) -> TimingLi
     """Return the limits with each torque limit reduced by a margin.
 
     Args:
+        limits: limits of velocity, acceleration and torque.
         margin: (n,) margins [N m or N].
+        chain: the arm, whose joints the message names.
 
     Raises:
         UsageError: for a margin that reaches the torque limit.
@@ -447,9 +475,11 @@ def _guarded(limits: TimingLimits, margin: np.ndarray, chain: Chain) -> TimingLi
 
 
 def _paths(chain: Chain, points: np.ndarray, straight: bool) -> tuple[list[JointPath], np.ndarray | None]:
-    """Return the paths through waypoints (m, n), and the largest deviation (2,) [m, rad] of straight lines.
+    """Return the paths through waypoints, and the largest deviation (2,) [m, rad] of straight lines.
 
     Args:
+        chain: the arm.
+        points: (m, n) waypoints [rad or m].
         straight: whether the tool moves on straight lines, one path each; otherwise there is one spline in joint space,
             and the deviation is None.
     """

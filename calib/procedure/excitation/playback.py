@@ -21,8 +21,8 @@ from calib.trajectories.basis import Family, SampledMotion
 from calib.trajectories.constraints import BoxLimit
 from calib.trajectories.design.search import SearchResult
 from calib.trajectories.design.verify import dense_motion
-from calib.trajectories.places import Clearance
 from calib.trajectories.setpoints import Setpoints, joined, slowed
+from calib.trajectories.workspace_limits import Clearance
 
 # [1/s, 1/s^2] acceleration and jerk of an approach over its speed, where none is stated
 APPROACH_RISE = DEFAULT_RISE
@@ -55,7 +55,14 @@ class Playback:
 
 
 def play(family: Family, result: SearchResult, inputs: ExcitationInputs, settings: ExcitationSettings) -> Playback:
-    """Return the setpoints of a designed motion: periods, and approach and rehearsal if the settings request them."""
+    """Return the setpoints of a designed motion: periods, and approach and rehearsal if the settings request them.
+
+    Args:
+        family: family of motions.
+        result: the motion, as variables of the family.
+        inputs: robot, model and limits.
+        settings: settings with rate, number of periods, start, and factor of the rehearsal.
+    """
     model, limits, chain = inputs.model, inputs.limits, inputs.chain
     # a period holds a whole number of the controller's samples
     period = family.period * result.factor
@@ -77,7 +84,12 @@ def play(family: Family, result: SearchResult, inputs: ExcitationInputs, setting
 
 
 def _with_torque(track: Setpoints, dynamics: ExcitedModel) -> Setpoints:
-    """Return setpoints with the largest predicted torques over all payloads; unchanged if parameters are unknown."""
+    """Return setpoints with the largest predicted torques over all payloads; unchanged if parameters are unknown.
+
+    Args:
+        track: the setpoints.
+        dynamics: the model that predicts the torques.
+    """
     if dynamics.values is None:
         return track
     torques = []
@@ -151,6 +163,11 @@ def approach_to(
 
 def check_start(start: Sequence[float] | None, chain: Chain, limits: MotionLimits) -> np.ndarray | None:
     """Return the joint values of a start as an array (n,); None for None.
+
+    Args:
+        start: joint values of the robot before the motion [rad or m]; None: unknown.
+        chain: the arm with n joints.
+        limits: limits of the motion.
 
     Raises:
         UsageError: for a wrong number of values, or a value beyond the joint limits.

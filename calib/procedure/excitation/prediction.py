@@ -74,8 +74,13 @@ class MotionPrediction:
 class PredictedSigma(NamedTuple):
     """A row of ``prediction.csv``: a parameter, and the σ predicted for the motion as it is to be run.
 
-    The value is None if unknown, and `rsd` is σ in percent of the value. `sigma_before` is the σ of the identification
-    that the motion complements, `sigma_geometry` the part of σ from the geometry; both are None if there is none.
+    Attributes:
+        name, unit: name and unit of the parameter.
+        value: its value; None if unknown.
+        sigma: predicted standard deviation.
+        rsd: `sigma` in percent of the value; None if the value is unknown.
+        sigma_before: σ by the identification that the motion complements; None: no such identification.
+        sigma_geometry: part of `sigma` that is due to the uncertain geometry; None if the geometry is taken as exact.
     """
 
     name: str
@@ -185,7 +190,8 @@ def _parameter_rows(
 
     Args:
         inputs: the robot and its model.
-        root, shifts: the two parts of the parameters' errors, see `_prediction`.
+        root: (c, c) square root of the parameters' covariance from torque errors.
+        shifts: (c, r) shifts of the parameters by the principal errors of the geometry.
         sigmas_before: (c,) σ of the identification that the motion complements; None: no such identification.
     """
     model, columns = inputs.model, inputs.columns.kept
@@ -211,8 +217,12 @@ def _parameter_rows(
 def known_sigmas(inputs: ExcitationInputs, task: Task) -> tuple[tuple[np.ndarray, float], list[float]]:
     """Return the σ that an earlier identification states, for the torques of a task and for the parameters.
 
+    Args:
+        inputs: the robot, its model and the earlier identification.
+        task: the typical task.
+
     Returns:
-        σ of torques (see `_torque_sigma`), and σ (c,) of parameters.
+        σ of each joint's torque (n,) with the rms of σ / torque limit, and σ (c,) of the parameters.
     """
     root = _root(_information_root(inputs))
     shifts = _shifts_before(inputs)
@@ -221,8 +231,10 @@ def known_sigmas(inputs: ExcitationInputs, task: Task) -> tuple[tuple[np.ndarray
 
 
 def _information_root(inputs: ExcitationInputs) -> np.ndarray:
-    """Return a square root W (c, c) of the earlier motions' information matrix Wᵀ W, for the c
-    columns of the design.
+    """Return a square root W (c, c) of the earlier motions' information matrix Wᵀ W.
+
+    Args:
+        inputs: model and earlier motions; c is the number of columns of the design.
     """
     assert inputs.prior is not None
     columns = inputs.columns.kept
@@ -231,14 +243,23 @@ def _information_root(inputs: ExcitationInputs) -> np.ndarray:
 
 
 def _root(W: np.ndarray) -> np.ndarray:
-    """Return a matrix C^(1/2) (c, c) with C^(1/2) C^(1/2)ᵀ equal to the covariance (Wᵀ W)⁻¹."""
+    """Return a square root C^(1/2) (c, c) of the covariance C = (Wᵀ W)⁻¹: C^(1/2) C^(1/2)ᵀ = C.
+
+    Args:
+        W: (rows, c) weighted observation matrix, or a square root of the information matrix.
+    """
     scale = np.maximum(np.linalg.norm(W, axis=0), 1e-300)
     _, s, vt = np.linalg.svd(W / scale, full_matrices=False)
     return (vt.T / np.maximum(s, 1e-12 * s[0])) / scale[:, None]
 
 
 def _geometry_torques(inputs: ExcitationInputs, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-    """Return the changes (N, rows, r) of the torques by r principal errors of the geometry; r = 0 without them."""
+    """Return the changes (N, rows, r) of the torques by r principal errors of the geometry; r = 0 without them.
+
+    Args:
+        inputs: the robot with its geometry's uncertainty, and the model.
+        q, v, a: (N, n) positions, velocities and accelerations.
+    """
     if inputs.geometry is None or inputs.model.values is None:
         return np.zeros((len(q), len(inputs.model.exact.joint_of_row), 0))
     return inputs.geometry.felt(inputs.model.values, q, v, a)
@@ -248,6 +269,9 @@ def _shifts_before(inputs: ExcitationInputs) -> np.ndarray:
     """Return the shifts (c, r) of an earlier identification's parameters by r principal errors of the geometry.
 
     Without principal errors, r is 0.
+
+    Args:
+        inputs: the earlier identification and the geometry's uncertainty.
     """
     if inputs.geometry is None:
         return np.zeros((len(inputs.columns.names), 0))
@@ -274,7 +298,12 @@ def _torque_sigma(
 
 
 def task_states(inputs: ExcitationInputs, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return random positions, velocities and accelerations q, v, a (TASK_STATES, n) of a typical task."""
+    """Return random positions, velocities and accelerations q, v, a (TASK_STATES, n) of a typical task.
+
+    Args:
+        inputs: the robot and its limits.
+        seed: seed of the states.
+    """
     n = inputs.chain.n
     box = inputs.limits.positions
     low = np.where(np.isfinite(box.lower), box.lower, -np.pi)
@@ -292,7 +321,12 @@ def task_states(inputs: ExcitationInputs, seed: int) -> tuple[np.ndarray, np.nda
 
 
 def task_of(inputs: ExcitationInputs, seed: int) -> Task:
-    """Return the typical task: regressors and effects of the geometry's errors at the states of `task_states`."""
+    """Return the typical task: regressors and effects of the geometry's errors at the states of `task_states`.
+
+    Args:
+        inputs: the robot and its model.
+        seed: seed of the states.
+    """
     states = task_states(inputs, seed)
     regressors = inputs.model.exact.regressor(*states)[:, :, inputs.columns.kept]
     return Task(regressors, _geometry_torques(inputs, *states))
@@ -342,7 +376,12 @@ def _prediction(
 
 
 def _band(motion: SampledMotion, period: float) -> float:
-    """Return the identification band [Hz]: twice the bandwidth f_dyn of the motion (`calib.data.signals.bandwidth`)."""
+    """Return the identification band [Hz]: twice the bandwidth f_dyn of a motion (`calib.data.signals.bandwidth`).
+
+    Args:
+        motion: the motion, sampled evenly over one period.
+        period: the period [s].
+    """
     power = np.abs(np.fft.rfft(motion.a, axis=0)) ** 2
     total = np.cumsum(power, axis=0)
     lines = np.argmax(total >= SHARE * total[-1], axis=0)[total[-1] > 0]
@@ -359,6 +398,13 @@ def _shortened(
     """Return family and solution of a motion with a shorter period; None if no such motion is possible.
 
     The search starts from the path of the given motion, scaled in amplitude by the ratio of the periods.
+
+    Args:
+        problem: optimisation problem of the designed motion.
+        motion: the designed motion.
+        problem_of: function that returns the optimisation problem for a period [s].
+        period: the shorter period [s].
+        evaluations: largest number of evaluations of the search.
     """
     try:
         shorter = replace(problem_of(period), stretch=(1.0, 1.0))
@@ -379,6 +425,10 @@ def write(rows: Sequence[PredictedSigma], folder: Path) -> Path:
     """Write the predicted σ of the parameters as CSV and return the file's path.
 
     Value and rsd [%] are empty for parameters with unknown values.
+
+    Args:
+        rows: the predicted parameters.
+        folder: folder of the designed motion.
     """
     header = list(PredictedSigma._fields)
     header[header.index("rsd")] = "rsd [%]"
@@ -389,6 +439,10 @@ def lines(outlook: MotionOutlook, predicted: Sequence[PredictedSigma] = ()) -> l
     """Return lines of text on the predicted σ of torques, for the designed motion and for motions of other durations.
 
     If the motion complements an identification, a line names the three parameters whose σ decreases most.
+
+    Args:
+        outlook: prediction for the designed motion and other durations.
+        predicted: predicted σ of the parameters; empty: no line on parameters.
     """
     by_period = ""
     if outlook.by_period:
@@ -444,6 +498,7 @@ def compared_with_identification(folder: Path, outcome: IdentificationOutcome) -
     ratio = sigma_ratio(predicted, identified, residual=residual, assumed=outlook.noise_share)
     if ratio is None:
         raise UsageError(
-            f"{folder} contains none of the {len(identified)} identified parameters: it belongs to another robot"
+            f"{folder} contains none of the {len(identified)} identified parameters, so it belongs to another robot: "
+            "give the excitation of this one"
         )
     return sentence(ratio)

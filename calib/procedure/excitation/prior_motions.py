@@ -29,7 +29,11 @@ MIN_RATE = 50
 
 
 class PrincipalErrors(Protocol):
-    """Principal errors g_i = √λ_i u_i, i = 1 … r, of a calibrated geometry with the covariance Σ λ_i u_i u_iᵀ."""
+    """Principal errors g_i (i = 1 … r) of a calibrated geometry: g_i = √λ_i u_i.
+
+    λ_i and u_i are the eigenvalues of the covariance of the geometric parameters that are not negligible, and their
+    eigenvectors.
+    """
 
     @property
     def before(self) -> np.ndarray:
@@ -37,7 +41,9 @@ class PrincipalErrors(Protocol):
         ...
 
     def felt(self, values: np.ndarray, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Return the changes (N, rows, r) of the torques by each principal error, at constant base parameters.
+        """Return the changes (N, rows, r) of the torques [N m or N] by each principal error.
+
+        The base parameters are constant.
 
         Args:
             values: (b,) base parameters.
@@ -53,7 +59,8 @@ class PriorMotions:
     Attributes:
         names: names of the files or folders of the motions.
         seconds: duration of the motions [s].
-        information: (b, b) ∫ ωᵀω dt of the design's columns ω, with the rows divided by `sigmas`.
+        information: (b, b) ∫ ωᵀω dt of the regressor ω (rows, b), restricted to the columns of the design, with the
+            rows divided by `sigmas`.
         sigmas: (rows,) square root of the torque errors' spectral density that an identification states; None: 1.
     """
 
@@ -169,13 +176,18 @@ def _identified_information(
 def designed_orders(folder: Path, chain: Chain) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Return q, v, a (N, n) of all periods of a designed motion, sampled at 50 Hz or more, and the sampling rate [Hz].
 
+    Args:
+        folder: folder that `calib excite` wrote.
+        chain: the arm.
+
     Raises:
         UsageError: if the motion belongs to a robot with other joints.
     """
     motion = coefficients.read(folder)
     if motion.joint_names != tuple(chain.joint_names):
         raise UsageError(
-            f"{folder}: the motion has joints {', '.join(motion.joint_names)}; {chain.name} has "
+            f"{folder}: the motion is of another robot: it has joints {', '.join(motion.joint_names)}, "
+            f"{chain.name} has "
             f"{', '.join(chain.joint_names)}"
         )
     count = max(MIN_SAMPLES, round(MIN_RATE * motion.period))

@@ -23,7 +23,10 @@ AIMS = ("logdet", "smallest", "torque", "parameters")
 
 
 def split_goal(text: str) -> tuple[str, float]:
-    """Return name and value of a goal such as ``wrist=0.1``.
+    """Return name and value of a goal.
+
+    Args:
+        text: the goal, such as ``wrist=0.1``.
 
     Raises:
         UsageError: for an unknown name, or a missing number.
@@ -40,6 +43,10 @@ def split_goal(text: str) -> tuple[str, float]:
 
 def checked_goal(text: object, aims: tuple[str, ...] = AIMS) -> object:
     """Return the text of a goal after checking its name and number; anything but a text is returned as it is.
+
+    Args:
+        text: the goal, such as ``wrist=0.1`` or ``logdet``.
+        aims: names of goals without a number.
 
     Raises:
         UsageError: for an unknown name, or a missing number.

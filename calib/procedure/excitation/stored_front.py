@@ -92,7 +92,11 @@ def read(folder: Path) -> StoredFront:
 
 
 def as_search_result(motion: Periodic, family: Family) -> SearchResult:
-    """Return a stored motion as the result of a search in a family of motions, whose merit is not computed.
+    """Return a stored motion as the result of a search, whose merit is not computed.
+
+    Args:
+        motion: the motion.
+        family: family of motions of the search, to which the motion must belong.
 
     Raises:
         UsageError: if the motion is of another family.

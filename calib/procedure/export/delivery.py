@@ -221,7 +221,13 @@ def _mjcf(export: Export, path: Path) -> list[str]:
 
 
 def write_drives(joints: Sequence[Joint], drives: identified.Drives, path: Path) -> None:
-    """Write ``drives.csv``: the drive parameters of joints and joint couplings, with their σ."""
+    """Write ``drives.csv``: the drive parameters of joints and joint couplings, with their σ.
+
+    Args:
+        joints: the joints.
+        drives: the parameters.
+        path: path of the file.
+    """
     names = [joint.name for joint in joints]
     kinds = [joint.kind for joint in joints]
     for first, second, weight in drives.pairs:
@@ -306,6 +312,10 @@ FILES = (
 
 def deliver(export: Export, out: Path) -> list[str]:
     """Write the calibrated robot into the folder `out` in all file formats; the module's docstring describes the files.
+
+    Args:
+        export: sources of the export.
+        out: the folder.
 
     Returns:
         Remarks on the written files, as text.
@@ -483,7 +493,12 @@ def mark(out: Path, verdicts: Verdicts) -> list[str]:
 
 
 def _uses(out: Path, of_files: Mapping[str, Verdicts]) -> Iterator[str]:
-    """Yield the lines of README.txt for each exported file: its use, and the verdict on it."""
+    """Yield the lines of README.txt for each exported file: its use, and the verdict on it.
+
+    Args:
+        out: folder of the export.
+        of_files: file name -> verdicts that apply to the file.
+    """
     with_dynamics = (out / PARAMETERS).exists()
     for file in FILES:
         name = file.name

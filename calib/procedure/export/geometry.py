@@ -78,13 +78,15 @@ def edited_urdf(robot: CalibratedChain, source: Path, for_corrections: bool = Fa
 
 
 def chain_in(tree: UrdfTree, chain: Chain, base: str | None = None) -> Chain:
-    """Return the chain in a URDF that has the joints and tip of another chain, as far as the URDF contains these names.
+    """Return the arm in a URDF that corresponds to another arm.
+
+    It has the joints and the tip of the other arm if the URDF contains these names; otherwise they are chosen by
+    default.
 
     Args:
         tree: the URDF.
-        chain: the other chain.
-        base, tip: names of the first and the last link; None: the other chain's tip, and the first link is determined
-            by the joints.
+        chain: the other arm.
+        base: name of the first link; None: determined by the joints.
     """
     joints = chain.joint_names if chain.joint_names[0] in tree.joints else None
     tip = chain.tip if chain.tip in tree.bodies else None
@@ -92,7 +94,7 @@ def chain_in(tree: UrdfTree, chain: Chain, base: str | None = None) -> Chain:
 
 
 def check_readback(edited: str, where: str, chain: Chain) -> str:
-    """Check that Pinocchio and yourdfpy compute the same poses from a URDF text as this toolkit (`MAX_DIFFERENCE`).
+    """Check that Pinocchio and yourdfpy compute the same poses from a URDF text as this toolkit.
 
     Args:
         edited: text of the URDF.
@@ -111,7 +113,8 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
     difference = float(np.abs(tip_poses(edited, urdf_chain, q) - forward(urdf_chain, q)).max())
     if difference > MAX_DIFFERENCE:
         raise RobotError(
-            f"{where}: poses differ by {difference:.2g} when Pinocchio reads the URDF; nothing was written"
+            f"{where}: poses differ by {difference:.2g} when Pinocchio reads the URDF; nothing was written: report "
+            "this as a bug"
         )
 
     q = q[:CHECKED_AGAIN]
@@ -125,7 +128,10 @@ def check_readback(edited: str, where: str, chain: Chain) -> str:
     expected = [joint_frames(urdf_chain, q) @ np.stack(turns)[:, None], forward(urdf_chain, q)[None]]
     difference = float(np.abs(T_base_links - np.concatenate(expected)).max())
     if difference > MAX_DIFFERENCE:
-        raise RobotError(f"{where}: poses differ by {difference:.2g} when yourdfpy reads the URDF; nothing was written")
+        raise RobotError(
+            f"{where}: poses differ by {difference:.2g} when yourdfpy reads the URDF; nothing was written: report "
+            "this as a bug"
+        )
     return "Pinocchio and yourdfpy read the same poses to 1e-9"
 
 
@@ -135,6 +141,10 @@ def export_offsets(robot: CalibratedChain, out: Path) -> Path:
     The offset is calibrated minus nominal: a joint with the reading q is at q + offset in the nominal robot's model. If
     the fit has joint corrections, offsets and their σ are those of the best geometry without corrections, for users who
     do not apply them.
+
+    Args:
+        robot: the calibrated robot.
+        out: path of the CSV file.
 
     Returns:
         Path of the table.

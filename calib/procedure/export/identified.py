@@ -93,7 +93,8 @@ def read(folder: Path, prior: str = "entropic") -> IdentifiedRobot:
 
     Args:
         folder: folder of the identification.
-        prior: prior for parameters that the torques do not identify, see `find_possible`.
+        prior: prior for parameters that the torques do not identify: ``entropic``, or ``euclidean``, its second-order
+            expansion.
     """
     refuse_currents(folder, "an export of masses")
     information = read_information(folder)
@@ -106,7 +107,12 @@ def read(folder: Path, prior: str = "entropic") -> IdentifiedRobot:
 
 @dataclass(frozen=True)
 class ExportedPrediction:
-    """Unexplained share of a recording's torque [%], predicted by the exported robot and by the identified model."""
+    """Unexplained share of a recording's torque [%], predicted by the exported robot and by the identified model.
+
+    Attributes:
+        file: table of the recording's torques, relative to the folder of the identification.
+        exported, identified: shares of the exported robot and of the identified model [%].
+    """
 
     file: str
     exported: float
@@ -122,7 +128,13 @@ class ExportedPrediction:
 def exported_prediction(robot: IdentifiedRobot, folder: Path) -> ExportedPrediction | None:
     """Return the torque prediction error of the exported robot on the recording with the largest error.
 
-    None if the recordings were made with payloads, or if an earlier version did not store their velocities.
+    Args:
+        robot: the identified robot.
+        folder: folder of the identification with tables of measured torques.
+
+    Returns:
+        The error; None if the recordings were made with payloads, or if an earlier version did not store their
+        velocities.
     """
     dynamics = without_left(robot.found.dynamics)
     identification = IdentificationFolder(folder)
@@ -190,7 +202,11 @@ def notes_of(robot: IdentifiedRobot) -> list[str]:
 
 
 def parameters(robot: IdentifiedRobot) -> dict[str, object]:
-    """Return the content of ``parameters.json``: parameters of geometry and dynamics with their covariances."""
+    """Return the content of ``parameters.json``: parameters of geometry and dynamics with their covariances.
+
+    Args:
+        robot: the identified robot.
+    """
     estimate, solution, chain = robot.information, robot.found, robot.chain
     model = solution.dynamics.model
     return {
@@ -317,8 +333,8 @@ def _link_bodies(robot: IdentifiedRobot, tree: UrdfTree, chain: Chain) -> tuple[
             loose_mass = sum(float(body[9]) for body in bodies if body is not None)
             raise RobotError(
                 f"{tree.where}: {total[9]:.3g} kg were identified between {joint.name} and the arm's next joint, and "
-                f"the file hangs {loose_mass:.3g} kg on link '{joint.child}' by joints that are not the arm's "
-                f"({listing(loose, 3)}): no possible body remains for the link. Either the motion does not identify "
+                f"the file attaches {loose_mass:.3g} kg to link '{joint.child}' by joints that are not the arm's "
+                f"({listing(loose, 3)}): no physically consistent body remains. Either the motion does not identify "
                 "that joint's mass (estimate.csv: its sigma), or the drive gains or the masses of those links are "
                 "wrong: correct these and identify again, or omit --urdf: then robot.urdf is the arm alone"
             )
@@ -341,8 +357,9 @@ def _sum(tree: UrdfTree, placements: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def _check(robot: IdentifiedRobot, source: str, chain: Chain, where: str, mjcf: bool = False) -> None:
-    """Check that Pinocchio computes the expected frames, torques, motor inertias and friction from a file on random
-    motion.
+    """Check that Pinocchio computes the expected dynamics from a file on random motion.
+
+    Compared are frames, torques, motor inertias and friction.
 
     Args:
         robot: the identified robot.
@@ -364,7 +381,8 @@ def _check(robot: IdentifiedRobot, source: str, chain: Chain, where: str, mjcf: 
         difference = float(np.abs(frames - moving_frames(robot.chain, q)).max())
         if difference > MAX_DIFFERENCE:
             raise RobotError(
-                f"{where}: poses differ by {difference:.2g} when Pinocchio reads the file; nothing was written"
+                f"{where}: poses differ by {difference:.2g} when Pinocchio reads the file; nothing was written: "
+                "report this as a bug"
             )
     share = float(np.abs(torques - expected).max()) / max(1.0, float(np.abs(expected).max()))
     if share > MAX_DIFFERENCE:
@@ -374,11 +392,15 @@ def _check(robot: IdentifiedRobot, source: str, chain: Chain, where: str, mjcf: 
         )
     for quantity, values, column in (("damping", damping, 1), ("friction", friction, 2)):
         if not np.allclose(values, robot.drives.values[:, column], rtol=MAX_DIFFERENCE, atol=1e-12):
-            raise RobotError(f"{where}: Pinocchio reads another {quantity} than was written")
+            raise RobotError(f"{where}: Pinocchio reads another {quantity} than was written: report this as a bug")
 
 
 def without_left(dynamics: Dynamics) -> Dynamics:
-    """Return an identified model in which drive terms without a column in ``drives.csv`` are zero."""
+    """Return an identified model in which drive terms without a column in ``drives.csv`` are zero.
+
+    Args:
+        dynamics: the identified model.
+    """
     omitted = drive_table(dynamics).left
     values = np.array(dynamics.values)
     for k, term in enumerate(dynamics.model.columns, dynamics.model.inertial):

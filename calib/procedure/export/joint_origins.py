@@ -20,7 +20,12 @@ _WORDS = {"yes", "no", "on", "off", "true", "false", "null"}  # no texts in YAML
 
 
 def block(value: Mapping[str, object], indent: str = "") -> str:
-    """Return the YAML text of a mapping from texts to mappings, texts and finite floats."""
+    """Return the YAML text of a nested mapping in block style.
+
+    Args:
+        value: mapping from texts to mappings, texts and finite floats.
+        indent: blanks at the beginning of each line.
+    """
     lines = []
     for key, item in value.items():
         head = f"{indent}{_text(key)}:"
@@ -61,7 +66,7 @@ def joint_origins(source: str, edited: str, where: str) -> str:
             continue
         turn = Rotation.from_matrix(joint.origin[:3, :3]).as_quat()
         if np.abs(Rotation.from_quat(turn).as_matrix() - joint.origin[:3, :3]).max() > max_difference:
-            refuse_robot(where, f"the rotation part of joint '{name}' is not a rotation matrix")
+            refuse_robot(where, f"the rotation part of joint '{name}' is not a rotation matrix: correct its origin")
         moved[name] = {
             "position": dict(zip("xyz", joint.origin[:3, 3].tolist())),
             "orientation": dict(zip("xyzw", turn.tolist())),

@@ -83,7 +83,7 @@ def write_package(
         notes.append("<ros2_control> is for mock hardware: name your robot's plugin in it")
     check_readback(content, str(target), chain)
     if lost:
-        notes.append(f"{len(lost)} meshes were not found and stay as they are written, as {lost[0]}")
+        notes.append(f"{len(lost)} meshes were not found; their file names are unchanged, such as {lost[0]}")
     needed = dict.fromkeys([*SHOWS, *(match[1] for each in lost if (match := _PACKAGE.match(each)))])
     made: dict[str, str | bytes] = {f"urdf/{robot}.urdf": content.encode(encoding)}
     made |= {place: file.read_bytes() for place, file in {**meshes, **configs}.items()}
@@ -138,7 +138,13 @@ def _with_own_meshes(
 
 
 def _with_control(content: str, robot: str, chain: Chain) -> str:
-    """Return a URDF's text with an added <ros2_control> for mock hardware with position commands."""
+    """Return a URDF's text with an added <ros2_control> for mock hardware with position commands.
+
+    Args:
+        content: text of the URDF.
+        robot: name of the robot.
+        chain: the arm, whose joints are controlled.
+    """
     joints = "".join(
         f'    <joint name={quoteattr(name)}>\n      <command_interface name="position"/>\n'
         '      <state_interface name="position"/>\n      <state_interface name="velocity"/>\n    </joint>\n'

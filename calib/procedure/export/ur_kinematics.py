@@ -56,7 +56,11 @@ def kinematics(robot: CalibratedChain, urdf: Path | None = None) -> tuple[str, s
 
 
 def _flange_note(robot: CalibratedChain) -> str:
-    """Return a remark on the assumed position of UR's flange if a fixed joint follows the last joint; else empty."""
+    """Return a remark on the assumed position of UR's flange if a fixed joint follows the last joint; else empty.
+
+    Args:
+        robot: the calibrated robot.
+    """
     nominal = nominal_of(robot)
     zero = np.zeros((1, nominal.n))
     behind = invert(joint_frames(nominal, zero)[-1, 0]) @ forward(nominal, zero)[0]
@@ -69,7 +73,11 @@ def _flange_note(robot: CalibratedChain) -> str:
 
 
 def _wrist_offset(nominal: Chain) -> float:
-    """Return the distance of the last joint's frame from axis 5 at q = 0 [m]: UR's length d6, or 0 in old URDFs."""
+    """Return the distance of the last joint's frame from axis 5 at q = 0 [m]: UR's length d6, or 0 in old URDFs.
+
+    Args:
+        nominal: the nominal arm.
+    """
     frames = joint_frames(nominal, np.zeros((1, nominal.n)))[:, 0]
     across = _axis(nominal, frames[1], int(nominal.moving[1]))
     return abs(float(across @ (frames[5, :3, 3] - frames[4, :3, 3])))
@@ -93,7 +101,7 @@ def _inertia_frame(nominal: Chain, urdf: Path | None, up: np.ndarray, ahead: np.
                 return pose
     level = ahead - up * (up @ ahead)
     if np.linalg.norm(level) < ON_AXIS:
-        raise RobotError("axis 3 stands over axis 2 at q = 0, where a UR is stretched")
+        raise RobotError("axis 3 lies above axis 2 at q = 0, where a UR is stretched")
     x = -level / np.linalg.norm(level)
     turned = pose_of(np.stack([x, np.cross(up, x), up], axis=1))
     rounded = np.round(turned)
@@ -155,6 +163,11 @@ def _axis(chain: Chain, frame: np.ndarray, k: int) -> np.ndarray:
 
 
 def _gap(one: np.ndarray, two: np.ndarray, direction: np.ndarray) -> float:
-    """Return the distance [m] of two parallel lines, given by a point (3,) on each and their unit direction (3,)."""
+    """Return the distance [m] of two parallel lines.
+
+    Args:
+        one, two: (3,) a point on each line [m].
+        direction: (3,) unit direction of the lines.
+    """
     between = two - one
     return float(np.linalg.norm(between - direction * (direction @ between)))

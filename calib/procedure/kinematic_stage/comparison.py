@@ -58,8 +58,9 @@ class Intervals:
 
     @property
     def record(self) -> PoseIntervalCoverage:
-        """Coverage and median radius of the 95 % intervals, and the number of rows that extrapolate, for
-        ``metrics.json``.
+        """Coverage and median radius of the 95 % intervals, and the number of rows that extrapolate.
+
+        This is the entry of ``metrics.json``.
         """
         return PoseIntervalCoverage(
             coverage_percent=100.0 * self.covered,
@@ -116,8 +117,9 @@ class Comparison:
 
     @property
     def of_urdf(self) -> Comparison:
-        """The comparison for the URDF alone: without joint corrections, and without intervals, which include
-        corrections.
+        """The comparison for the URDF alone: without joint corrections and without intervals.
+
+        Intervals are left out since they include the corrections.
         """
         if self.alone is None:
             return self
@@ -157,7 +159,11 @@ class Comparison:
 
 
 def _position_means(blocks: Sequence[PoseMeasurements]) -> str:
-    """Return as text which distance is called position error: that of positions, sockets or planes."""
+    """Return as text which distance is called position error: that of positions, sockets or planes.
+
+    Args:
+        blocks: the measurements.
+    """
     kinds = [block.kind for block in blocks if block.kind not in WITHOUT_POSITIONS]
     means = dict.fromkeys(MEASURED.get(kind, "position") for kind in kinds)
     return " or ".join(means) or "position"
@@ -267,7 +273,11 @@ def compare_unseen(
 
 
 def interval_cells(comparison: Comparison) -> np.ndarray:
-    """Return the values (m, 3) of the columns `INTERVAL` for all m rows; NaN if the fit has no error model."""
+    """Return the values (m, 3) of the columns `INTERVAL` for all m rows; NaN if the fit has no error model.
+
+    Args:
+        comparison: errors on the m rows.
+    """
     intervals = comparison.intervals
     if intervals is None:
         row_count = sum(len(block) for block in comparison.blocks)

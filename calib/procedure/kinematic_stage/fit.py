@@ -120,14 +120,19 @@ T = TypeVar("T", bound=Outcome)
 
 
 def weighing_settings(options: FitOptions, settings: FitSettings) -> Settings:
-    """Return the settings of the residuals' loss function: the loss in the fit's settings, otherwise in the options
-    file.
+    """Return the settings of the residuals' loss function.
+
+    The loss in the fit's settings has precedence over the loss in the options file.
+
+    Args:
+        options: content of the options file.
+        settings: settings of the fit.
     """
     return Settings(settings.loss or options.loss, options.loss_scale)
 
 
 def _silent(stage: str) -> None:
-    """Ignore a progress text."""
+    """Ignore a progress text, `stage`."""
 
 
 def run(
@@ -140,7 +145,7 @@ def run(
     """Fit the geometry, and return the chosen model, errors on all rows, and the verdict.
 
     Args:
-        inputs: see `calib.procedure.kinematic_stage.inputs.gather`.
+        inputs: robot, rows to fit, and validation rows.
         options: content of the fit options file; None: defaults.
         settings: model, loss and folds of the ladder, tolerance, seed; None: defaults.
         progress: called with a text on each stage; None: silent.
@@ -217,8 +222,9 @@ def run(
 def _rigid_misfit(
     selection: ModelSelection, changes: Sequence[Finding], climb: Callable[..., ModelSelection], weighing: Settings
 ) -> Finding | None:
-    """Return a finding if no rigid geometry explains the rows, or if a few grossly wrong rows are the reason; otherwise
-    None.
+    """Return a finding if no rigid geometry explains the rows, or if a few rows with gross errors are the reason.
+
+    Otherwise, None is returned.
 
     Args:
         selection: the selection of models.
@@ -243,7 +249,15 @@ def _residual_findings(
     rigid_misfit: Finding | None,
     weighing: Settings,
 ) -> list[Finding]:
-    """Return findings on the residuals of a fit: changed rows, misfit, moved instrument, joints, images."""
+    """Return findings on the residuals of a fit: changed rows, misfit, moved instrument, joints, images.
+
+    Args:
+        selection: the selection of models.
+        inputs: robot and measurements.
+        changes: findings on changed rows.
+        rigid_misfit: finding that no rigid geometry explains the rows; None: a rigid geometry explains them.
+        weighing: settings of the loss function.
+    """
     notes = list(changes)
     if rigid_misfit:
         notes.append(rigid_misfit)
@@ -255,6 +269,11 @@ def _residual_findings(
 
 def _check_convergence(selection: ModelSelection, inputs: Inputs, options: FitOptions) -> None:
     """Check that the chosen model's fit has converged.
+
+    Args:
+        selection: the selection of models.
+        inputs: robot and measurements.
+        options: content of the options file, with the accepted findings.
 
     Raises:
         NotConverged: if it has not; the message contains findings that may be the reason.
@@ -321,7 +340,8 @@ def _findings(
 def _moved_between(nominal: Installation, blocks: Sequence[PoseMeasurements], settings: Settings) -> list[Finding]:
     """Return a finding if the instrument seems to have moved between the files; otherwise an empty list.
 
-    The finding is made if the nominal arm's errors are much smaller when each file gets a station of its own.
+    The finding is made if the nominal arm's errors are much smaller when each file has a separate station (position of
+    the instrument).
 
     Args:
         nominal: the nominal arm with base and tool placed.

@@ -52,7 +52,13 @@ NOT_FITTED = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class EstimateTable:
-    """Rows of ``estimate.csv`` (name, unit, nominal value, value), and the covariance (rows, rows) of the values."""
+    """Fitted parameters as in ``estimate.csv``.
+
+    Attributes:
+        names, units: names and units of the parameters.
+        nominal, values: nominal and fitted values.
+        covariance: (rows, rows) covariance of the values.
+    """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
@@ -125,7 +131,11 @@ def read_covariance(folder: Path, cell: Installation) -> tuple[np.ndarray, np.nd
 
 
 def _values(cell: Installation) -> np.ndarray:
-    """Return the full parameter vector of an installation; frames are represented by position and rotation vector."""
+    """Return the full parameter vector of an installation; frames are represented by position and rotation vector.
+
+    Args:
+        cell: the installation (arm with stations and tools).
+    """
     frames = []
     for frame in (*cell.stations, *cell.tools):
         frames += [frame[:3, 3], rotation_vector(frame[:3, :3])]
@@ -134,7 +144,11 @@ def _values(cell: Installation) -> np.ndarray:
 
 
 def _to_table(cell: Installation) -> np.ndarray:
-    """Return the Jacobian (p, p) of the values in the table with respect to steps along the parameters."""
+    """Return the Jacobian (p, p) of the values in the table with respect to steps along the parameters.
+
+    Args:
+        cell: the installation (arm with stations and tools).
+    """
     jacobian = np.eye(len(layout(cell).names))
     start = len(cell.chain.elements)
     for frame in (*cell.stations, *cell.tools):
@@ -154,6 +168,9 @@ def residuals(outcome: Outcome) -> tuple[Iterator[Sequence[object]], list[str]]:
     Held-out rows also have the columns of `INTERVAL`, as in ``errors.csv`` of a session: ``sigma`` is the standard
     deviation of the calibrated arm's position error by the fit's error model, ``interval95`` is the radius that
     contains 95 % of such errors, and ``extrapolated`` is 1 if a joint is outside the range of the fitted rows.
+
+    Args:
+        outcome: the fit.
     """
     sets = [("fit", outcome.fit)]
     for name, unseen in outcome.inputs.unseen.items():
@@ -218,6 +235,11 @@ def _nominal_sizes(nominal: Installation, block: Block, count: int) -> np.ndarra
     """Return the size (m,) of the nominal arm's residuals [mm].
 
     It is the size of the position residual if positions were measured, otherwise of the first measured quantity.
+
+    Args:
+        nominal: the nominal arm with base and tool placed.
+        block: measurements, prepared for the computation of residuals.
+        count: number m of rows.
     """
     sizes = np.full(count, np.nan)
     for part in observe(nominal, block, NO_PARAMETERS):
@@ -257,7 +279,12 @@ def write_errors(path: Path, arm: Chain, validation: Mapping[str, Comparison]) -
 
 
 def _error_vectors(comparison: Comparison, number: int) -> np.ndarray:
-    """Return measured positions [m] and error vectors of both arms [mm] of one block (m, 9); NaN without positions."""
+    """Return measured positions [m] and error vectors of both arms [mm] of one block (m, 9); NaN without positions.
+
+    Args:
+        comparison: errors on the blocks.
+        number: index (from 0) of the block.
+    """
     block = comparison.blocks[number]
     if not isinstance(block, Positions):
         return np.full((len(block), 9), np.nan)

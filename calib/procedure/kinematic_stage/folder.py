@@ -168,7 +168,9 @@ class ValidationFolder:
 def _read(kind: type[T], path: Path) -> T:
     content = read_json(path, "fit again")
     if content.get("schema", 1) > SCHEMA:
-        raise UsageError(f"{path}: schema {content['schema']} of a later version, this one reads up to {SCHEMA}")
+        raise UsageError(
+            f"{path}: schema {content['schema']} is of a later version, this one reads up to {SCHEMA}: upgrade"
+        )
     if content.get("findings"):
         content["findings"] = _current_form(content["findings"])
     with refused_as(UsageError, ValueError, f"{path} cannot be read ({{}}); fit again"):
@@ -258,7 +260,7 @@ def _write_all(outcome: Outcome, folder: Path) -> None:
 
 
 def metrics(outcome: Outcome) -> FitMetrics:
-    """Return the content of ``metrics.json`` for a fit."""
+    """Return the content of ``metrics.json`` for the outcome of a fit."""
     tolerance_mm = None
     if outcome.settings.tolerance is not None:
         tolerance_mm = 1e3 * outcome.settings.tolerance
@@ -286,7 +288,11 @@ def metrics(outcome: Outcome) -> FitMetrics:
 
 
 def _record(outcome: Outcome) -> dict[str, object]:
-    """Return the entries of ``robot.toml`` on the fit: files, model, seed, verdict and nominal frames."""
+    """Return the entries of ``robot.toml`` on the fit: files, model, seed, verdict and nominal frames.
+
+    Args:
+        outcome: the fit.
+    """
     verdict = outcome.verdict
     nominal_frames = installation.frame_tables(outcome.nominal_cell)
     record: dict[str, object] = {f"nominal_{kind}": table for kind, table in nominal_frames.items()}
@@ -300,7 +306,12 @@ def _record(outcome: Outcome) -> dict[str, object]:
 
 
 def _write_corrections(corrections: CorrectedChain, folder: Path) -> None:
-    """Write the table of joint corrections, which a URDF cannot contain, and a text on how to apply them."""
+    """Write the table of joint corrections, which a URDF cannot contain, and a text on how to apply them.
+
+    Args:
+        corrections: the arm's joint corrections.
+        folder: folder to write into.
+    """
     chain, deflection = corrections.chain, corrections.deflection
     unit_of = dict(zip(chain.names, chain.units))
     joint_of = {element.name: element.joint for element in chain.elements}

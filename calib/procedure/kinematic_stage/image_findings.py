@@ -20,7 +20,10 @@ MAX_NOISE = 4.0
 
 
 def image_coverage(fit: GeometricFit) -> tuple[ImageCoverage, ...]:
-    """Return how densely the corners in a fit cover the image area, for each set of images; empty without images."""
+    """Return the number of corners in each cell of the image area, and their errors, for each set of images.
+
+    Empty without images.
+    """
     result = []
     for piece in fit.pieces:
         block, part = fit.blocks[piece.block].measured, piece.part
@@ -37,7 +40,12 @@ def image_coverage(fit: GeometricFit) -> tuple[ImageCoverage, ...]:
 
 
 def reprojection(cell: Installation, blocks: Sequence[PoseMeasurements]) -> float | None:
-    """Return the rms distance between detected and predicted corners [px]; None without images."""
+    """Return the rms distance between detected and predicted corners [px]; None without images.
+
+    Args:
+        cell: arm, camera and board, which predict the corners.
+        blocks: the measurements.
+    """
     images = [block for block in blocks if isinstance(block, Pixels)]
     no_parameters = np.array([], dtype=int)
     squares: list[np.ndarray] = []

@@ -43,7 +43,7 @@ class Unseen:
         block: the measurements; station and tool have the names of the fit's station and tool unless `own_frames`.
         own_frames: whether base and tool placement are to be fitted to these rows.
         held_out: True for a held-out share of a fit file, False for a validation file.
-        seen: whether the same rows were fitted, so that their errors are no evidence.
+        seen: whether these rows were fitted, too, so that their errors are no evidence.
     """
 
     block: PoseMeasurements
@@ -91,8 +91,9 @@ class Inputs:
 
     @property
     def bare(self) -> Chain | None:
-        """Geometry of an earlier fit for use without its joint corrections; None if the earlier fit
-        has no corrections.
+        """Geometry of an earlier fit for use without its joint corrections.
+
+        None if the earlier fit has no corrections.
         """
         if self.earlier is None or self.earlier.corrections is None:
             return None
@@ -119,12 +120,12 @@ def gather(
     """Return the inputs of a fit from files: the robot, the named stations and tools, fitted and held-out rows.
 
     Args:
-        robot: a name or file, see `calib.robot.library`; or a robot in memory.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
         measured: files, or blocks in memory, to fit.
         validate: files, or blocks in memory, for the validation.
         options: options for reading the files; None: defaults.
         settings: stations, tools, share of rows to hold out, and seed; None: defaults.
-        base, tip: links of a URDF; None: see `calib.robot.library`.
+        base, tip: first and last link of the arm in a URDF; None: chosen by the joint columns of the measurements.
 
     Raises:
         UsageError: without a measurement file.
@@ -242,10 +243,10 @@ def load_robot(
     """Return a robot's chain and its file; the chain of a URDF is the one with the joints of the measured table.
 
     Args:
-        robot: a name or file, see `calib.robot.library`; or a robot in memory.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
         measured: file with joint columns; None: the table is not considered.
         options: options for reading the file.
-        base, tip: links of a URDF; None: chosen by default.
+        base, tip: first and last link of the arm in a URDF; None: chosen by default.
     """
     if isinstance(robot, CalibratedChain):
         return robot.complete, Path(robot.source or robot.chain.name)
@@ -276,9 +277,9 @@ def load_rigid(
     corrections. The geometry that was fitted together with corrections is less accurate without them.
 
     Args:
-        robot: a name or file, see `calib.robot.library`; or a robot in memory.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
         measured: table whose joint columns determine the chain of a URDF; None: no table.
-        base, tip: links of a URDF; None: chosen by default.
+        base, tip: first and last link of the arm in a URDF; None: chosen by default.
     """
     if isinstance(robot, CalibratedChain):
         return robot, Path(robot.source or robot.chain.name)
@@ -292,6 +293,12 @@ def load_rigid(
 
 def _check_joint_columns(chain: Chain, source: Path, measured: Path, base: str | None) -> None:
     """Check that a table has columns for all revolute joints of the arm, since other positions would be unknown.
+
+    Args:
+        chain: the arm that was chosen by the table's columns.
+        source: file of the robot.
+        measured: the table.
+        base: first link of the arm; None: chosen by default.
 
     Raises:
         UsageError: if a column is missing.
@@ -359,7 +366,12 @@ def read_file(
 
 
 def gravity_of(chain: Chain, q: np.ndarray) -> np.ndarray | None:
-    """Return gravity torques (m, n) [N m] at joint values (m, n); None if the robot's masses are unknown."""
+    """Return gravity torques (m, n) [N m or N] at joint values (m, n); None if the robot's masses are unknown.
+
+    Args:
+        chain: the arm with its masses.
+        q: joint values [rad or m].
+    """
     if chain.inertias is None or len(chain.driven) != chain.n:
         return None
     return gravity_torques(chain, q)
@@ -393,14 +405,14 @@ def hold_out(block: PoseMeasurements, share: float, seed: int) -> tuple[PoseMeas
     order = np.random.default_rng(seed).permutation(count)
     if held_count == 0 or held_count == count:
         raise MeasurementError(
-            f"a hold-out share of {share:g} gives {held_count} of {count} poses; change it", block.file
+            f"a hold-out share of {share:g} gives {held_count} of {count} poses; state another share", block.file
         )
     held_out = np.isin(pose, order[count - held_count :])
     return take(block, np.flatnonzero(~held_out)), take(block, np.flatnonzero(held_out))
 
 
 def _pose_of_row(block: PoseMeasurements) -> np.ndarray:
-    """Return the index (m,) of the pose, or measured pair of poses, for each row.
+    """Return the index (m,) of the pose, or measured pair of poses, for each row of a block.
 
     Cycles of a repeated pose have the same index.
     """
@@ -420,10 +432,16 @@ def pose_count(blocks: Sequence[PoseMeasurements]) -> int:
 def _with_station_and_tool_names(
     read_blocks: Sequence[tuple[Path, PoseMeasurements]], options: FitOptions, stations: str, tools: str
 ) -> list[PoseMeasurements]:
-    """Return the blocks to fit with station and tool names by the options --stations and --tools; all names are
-    distinct.
+    """Return the blocks to fit with station and tool names by the options --stations and --tools.
 
-    If the arm carried a camera and another target, or two cameras, these are different tools, regardless of --tools.
+    All names are distinct. If the arm carried a camera and another target, or two cameras, these are different tools,
+    regardless of --tools.
+
+    Args:
+        read_blocks: (file, measurements) of each block.
+        options: options for reading the files, which may state names.
+        stations: ``one`` base placement for all files, or one for each.
+        tools: one tool for all files, or one for each.
     """
     carried = list(dict.fromkeys(block.carried for _, block in read_blocks))
     station_of: dict[Path, str] = {}
@@ -455,7 +473,12 @@ def _with_station_and_tool_names(
 
 
 def _carried_name(device: tuple[str, object], carried: Sequence[tuple[str, object]]) -> str:
-    """Return the name of the tool in a file: its kind, with a number if it is not the first tool of this kind."""
+    """Return the name of the tool in a file: its kind, with a number if it is not the first tool of this kind.
+
+    Args:
+        device: kind and identity of what the arm carried in the file.
+        carried: kind and identity of everything that the arm carried in any file, each once.
+    """
     kind = device[0]
     of_kind = [candidate for candidate in carried if candidate[0] == kind]
     number = of_kind.index(device) + 1
@@ -465,7 +488,7 @@ def _carried_name(device: tuple[str, object], carried: Sequence[tuple[str, objec
 
 
 def _free_name(unseen: Mapping[str, Unseen], file: str) -> str:
-    """Return the name of a file as a key of `unseen`, or its path if this name is already used."""
+    """Return the name of a file as a key for `unseen`, or its path if this name is already used there."""
     if Path(file).name not in unseen:
         return Path(file).name
     name = file
@@ -499,6 +522,7 @@ def _with_frames_of_fit(block: PoseMeasurements, fit: Sequence[PoseMeasurements]
     if len(block.tool_names) != len(fit[0].tool_names):
         tools = ", ".join(block.tool_names)
         raise UsageError(
-            f"{block.file}: the fit has no tool {tools}, only {', '.join(sorted(fit_tools))}; refit_frames"
+            f"{block.file}: the fit has no tool {tools}, only {', '.join(sorted(fit_tools))}; refit its frames "
+            "(--refit-frames)"
         )
     return replace(block, tool_names=fit[0].tool_names)

@@ -72,7 +72,11 @@ class ComparedRows:
     position_means: str = "position"
 
     def words(self, nature: str) -> str:
-        """Return the printed name of an error (position, orientation, distance), which depends on the measurements."""
+        """Return the printed name of an error, which depends on the measurements.
+
+        Args:
+            nature: kind of the error: position, orientation or distance.
+        """
         if nature == "position":
             return self.position_means
         return nature
@@ -90,7 +94,14 @@ class ComparedRows:
 
 @dataclass(frozen=True)
 class Outlier:
-    """A row with a large residual, in robust standard deviations of all rows, and in mm or deg."""
+    """A row with a large residual.
+
+    Attributes:
+        file, row: file and row number.
+        nature: kind of the residual: position, orientation or distance.
+        sigmas: size of the residual, in robust standard deviations of all rows.
+        size_mm, size_deg: size in mm or in degrees; the other one is None.
+    """
 
     file: str
     row: int
@@ -124,8 +135,8 @@ class Findings:
         reach: reach of the arm [m].
         loss: loss function that was used; empty if unknown.
         noticed: findings on the fit that do not depend on held-out rows, worst first.
-        blind: stations that were cross-validated only by regions, since their tool is not identifiable from the other
-            stations.
+        blind: stations that cross-validation could not hold out as a whole, since the other stations do not determine
+            their tool; only regions of their poses were held out.
         discrepancy: distribution of the error at a pose, estimated by cross-validation; None if not estimated.
         rigid_cross_validated: cross-validated error of the best model without joint corrections [m]; None if not
             computed.
@@ -174,7 +185,19 @@ class ValidationMetrics:
 
 @dataclass(frozen=True, kw_only=True)
 class FitMetrics(ValidationMetrics):
-    """The content of a fit's ``metrics.json``; see `calib.procedure.kinematic_stage.folder`."""
+    """The content of a fit's ``metrics.json``.
+
+    Attributes:
+        fit: errors of both arms on the fitted rows.
+        model: name of the chosen model.
+        ladder: tried models with their cross-validated errors.
+        seed: seed of all random numbers.
+        tolerance_mm: largest acceptable rms on held-out poses [mm]; None: none was stated.
+        not_identifiable: texts on parameters that the poses do not identify.
+        outliers: fitted rows with large residuals, worst first.
+        findings: findings that the verdict needs besides the errors; None in files of earlier versions.
+        status: how the optimisation ended; empty in files of earlier versions.
+    """
 
     fit: ComparedRows
     model: str

@@ -73,7 +73,7 @@ def misfit(selection: ModelSelection, reach: float) -> Finding | None:
 
 
 def gross_rows(selection: ModelSelection, robust: ModelSelection, reach: float) -> Finding | None:
-    """Return a finding if a few grossly wrong rows cause the error that `misfit` reports; otherwise None.
+    """Return a finding if a few rows with gross errors cause the error that `misfit` reports; otherwise None.
 
     Args:
         selection: models fitted with a loss that gives full weight to every row.
@@ -106,8 +106,7 @@ def _position_rms(fit: GeometricFit) -> float:
 
 
 def of_range(measured_range: JointRange, tolerance: float | None) -> list[Finding]:
-    """Return findings on the joint range in which a calibration is valid, and on the predicted error outside this
-    range.
+    """Return findings on the joint range in which a calibration is valid, and on the error outside this range.
 
     Args:
         measured_range: the measured range, and the predicted σ over the arm's whole range.
@@ -184,8 +183,9 @@ def findings(
 
 
 def _as_positions(block: PoseMeasurements) -> PoseMeasurements:
-    """Return a block of measurements; images are replaced by board poses, whose scale is that of
-    the board's squares.
+    """Return a block of measurements with positions.
+
+    Images are replaced by board poses, whose scale is that of the board's squares; other blocks are unchanged.
     """
     if not isinstance(block, Pixels):
         return block
@@ -198,8 +198,15 @@ def _as_positions(block: PoseMeasurements) -> PoseMeasurements:
 def _wrong_columns(
     nominal: Installation, blocks: Sequence[PoseMeasurements], before: float, reach: float
 ) -> list[Finding]:
-    """Return a finding if the nominal arm explains the rows after a change of columns or rows;
-    otherwise an empty list.
+    """Return a finding if the nominal arm explains the rows after a change of columns or rows.
+
+    Otherwise, the list is empty.
+
+    Args:
+        nominal: the arm before the fit, with base and tool placed.
+        blocks: the rows.
+        before: rms error of the nominal arm [m].
+        reach: reach of the arm [m].
     """
     if not before > FLOOR * reach:
         return []
@@ -211,6 +218,10 @@ def _misread(nominal: Installation, blocks: Sequence[PoseMeasurements]) -> list[
     """Return a finding if the measured orientations fit the arm by another convention of angles than the stated one.
 
     Otherwise, the list is empty.
+
+    Args:
+        nominal: the arm before the fit, with base and tool placed.
+        blocks: the rows.
     """
     angle = errors(nominal, blocks).orientation
     if angle is None or not np.sqrt(np.mean(angle**2)) > limit("orientations-off", "angle"):
@@ -222,6 +233,10 @@ def _explanation(change: Explanation | None, nominal: Installation) -> list[Find
     """Return a finding on a change of columns that explains the rows.
 
     An empty list if there is no such change, or if the finding reaches no level of the catalogue.
+
+    Args:
+        change: the change of columns; None: there is none.
+        nominal: the arm, which names the joints.
     """
     if change is None:
         return []
@@ -233,7 +248,12 @@ def _explanation(change: Explanation | None, nominal: Installation) -> list[Find
 
 
 def _large_changes(fit: GeometricFit, reach: float) -> list[Finding]:
-    """Return a finding if fitted elements differ implausibly much from nominal; otherwise an empty list."""
+    """Return a finding if fitted elements differ implausibly much from nominal; otherwise an empty list.
+
+    Args:
+        fit: the fit.
+        reach: reach of the arm [m], to which changes of lengths are compared.
+    """
     large = []
     for element, value, nominal in zip(fit.cell.chain.elements, fit.cell.chain.values, fit.start.chain.values):
         change = float(value - nominal)

@@ -74,8 +74,8 @@ class Chosen:
 
     Attributes:
         chain: the nominal arm.
-        selection: see `calib.poses.select`.
-        parameters: number of parameters that are identifiable from the measurements.
+        selection: the selected poses with index and efficiency (`calib.poses.select.Selection`).
+        parameters: number of parameters that are identifiable from measurements at any poses.
         existing: index of the existing poses alone; None without existing poses, or if they are too few.
         checked, unchecked: constraints that were checked, and constraints that could not be checked, as text.
         notes: other remarks for the user.
@@ -117,7 +117,7 @@ class Chosen:
         """Return lines of text on the checked constraints, the unchecked constraints, and the run."""
         lines = []
         if self.checked:
-            lines.append(f"kept: {', '.join(self.checked)}")
+            lines.append(f"respected: {', '.join(self.checked)}")
         if self.unchecked:
             lines.append(f"NOT checked: {', '.join(self.unchecked)}")
         return lines + run_lines(self.run, self.driven)
@@ -138,13 +138,12 @@ def choose(
     """Return the m poses that determine the robot's geometry best.
 
     Args:
-        robot: a name or file, see `calib.robot.library`; or a robot in memory.
+        robot: name of a library robot, file (URDF, or MDH table in TOML), folder of a fit, or a robot in memory.
         m: number of poses.
         settings: quantity to measure, index, method, seed.
-        constraints: constraints file, or its content as tables, see `calib.procedure.measuring.constraints_file`; None:
-            defaults.
+        constraints: constraints file (`calib formats constraints`), or its content as tables; None: defaults.
         existing: poses measured earlier, which the selection complements: a CSV, or in memory; None: none.
-        base, tip: links of a URDF; None: see `calib.robot.library`.
+        base, tip: first and last link of the arm in a URDF; None: its root, and its flange.
         map: function that runs parallel work (`calib.workers`).
         progress: called with (done, total, text); None: silent.
 
@@ -221,6 +220,13 @@ def _draw_views(
 ) -> np.ndarray:
     """Return feasible postures (N, n) at which the camera sees the board, at least twice as many as shall be selected.
 
+    Args:
+        view: camera and board.
+        space: search space with all constraints.
+        limits: joint limits and constraints.
+        settings: settings of the selection.
+        m: number of poses to select.
+
     Raises:
         UsageError: if fewer postures are found.
     """
@@ -253,7 +259,12 @@ def _search_settings(settings: SelectionSettings) -> SearchSettings:
 
 
 def _in_driving_order(selection: Selection, driven: Drivable) -> Selection:
-    """Return the selection in the order of the run, with index and efficiency updated for replaced poses."""
+    """Return the selection in the order of the run, with index and efficiency updated for replaced poses.
+
+    Args:
+        selection: the selected poses.
+        driven: the run through the poses, with replacements of unreachable poses.
+    """
     value = selection.value
     history = selection.history
     if driven.replaced:
@@ -276,6 +287,11 @@ def _in_driving_order(selection: Selection, driven: Drivable) -> Selection:
 
 def _draw_feasible(space: SearchSpace, limits: Limits, settings: SelectionSettings) -> np.ndarray:
     """Return random feasible poses as candidates.
+
+    Args:
+        space: search space with all constraints.
+        limits: joint limits and constraints.
+        settings: settings of the selection.
 
     Raises:
         UsageError: if too few poses are feasible; the message lists the constraints.
@@ -301,16 +317,17 @@ def _draw_feasible(space: SearchSpace, limits: Limits, settings: SelectionSettin
 def _outlook(
     jacobian: Observation, limits: Limits, search: SearchSettings, q: np.ndarray, exchange: Exchange, comparable: float
 ) -> PoseOutlook:
-    """Return the predicted accuracy with poses q (m, n), with other numbers of poses, and without line-of-sight
-    constraints.
+    """Return the predicted accuracy with the selected poses and in other cases.
+
+    The other cases are other numbers of poses, and no line-of-sight constraints.
 
     Args:
         jacobian: observation Jacobian.
         limits: limits of poses.
         search: settings of the search.
-        q: selected poses [rad or m].
+        q: (m, n) selected poses [rad or m].
         exchange: candidate poses, and Jacobians of poses measured earlier.
-        comparable: index of poses selected with line-of-sight constraints.
+        comparable: observability index of poses selected with line-of-sight constraints.
     """
     space = limits.space(jacobian, sight=False)
     existing = exchange.before
@@ -352,13 +369,22 @@ def beside_poses(out: Path, plots: bool, chosen: Chosen | None = None) -> dict[s
 
 
 def targets(out: Path, plots: bool) -> files.Results:
-    """Return the paths of all files that a selection may write, with their allowed suffixes."""
+    """Return the paths of all files that a selection may write, with their allowed suffixes.
+
+    Args:
+        out: path of the selection's CSV.
+        plots: whether figures are written.
+    """
     beside = beside_poses(out, plots).values()
     return [(out, (".csv",)), *((path, (path.suffix,)) for path in beside)]
 
 
 def write(chosen: Chosen, path: Path) -> Path:
     """Write the selected poses to a CSV with the joints' names [rad or m], and the predicted accuracy next to it.
+
+    Args:
+        chosen: the selection.
+        path: path of the CSV.
 
     Returns:
         Path of the CSV.
@@ -372,7 +398,13 @@ def write(chosen: Chosen, path: Path) -> Path:
 
 
 def bound_words(selection: Selection) -> str:
-    """Return a text on the efficiency's bound: the set of poses to which it applies, and its accuracy."""
+    """Return a text on the bound of a selection's efficiency.
+
+    It names the set of poses to which the bound applies, and the bound's accuracy.
+
+    Args:
+        selection: the selected poses with their efficiency.
+    """
     ceiling = selection.ceiling
     if ceiling.climbs:
         percent = 100 * ceiling.gap
@@ -385,7 +417,11 @@ def bound_words(selection: Selection) -> str:
 
 
 def record(chosen: Chosen) -> dict[str, object]:
-    """Return the results of a selection as numbers by name; `table` returns them as text."""
+    """Return the results of a selection as numbers by name; `table` returns them as text.
+
+    Args:
+        chosen: the selection.
+    """
     selection = chosen.selection
     rms = chosen.outlook.poses.rms
     return {
@@ -408,7 +444,11 @@ def record(chosen: Chosen) -> dict[str, object]:
 
 
 def table(chosen: Chosen) -> list[tuple[str, str]]:
-    """Return the results of a selection as pairs of label and text."""
+    """Return the results of a selection as pairs of label and text.
+
+    Args:
+        chosen: the selection.
+    """
     selection = chosen.selection
     index = f"{selection.index}"
     if selection.index == "O1":
@@ -431,7 +471,11 @@ def table(chosen: Chosen) -> list[tuple[str, str]]:
 
 
 def predicted_rows(chosen: Chosen) -> list[tuple[str, str]]:
-    """Return table rows (label, text) on the predicted accuracy, and on the accuracy lost by lines of sight."""
+    """Return table rows (label, text) on the predicted accuracy, and on the accuracy lost by lines of sight.
+
+    Args:
+        chosen: the selection.
+    """
     outlook = chosen.outlook
     rows = forecast.table(outlook.poses, outlook.others)
     if outlook.blind is None:

@@ -158,6 +158,12 @@ def _frames_verdict(worst: _Proof, tolerance: float | None, arm: str, findings: 
     """Return the verdict if only base and tool placement (frames) were fitted.
 
     With a tolerance it is pass or follows from the findings; without a tolerance it is not judged.
+
+    Args:
+        worst: the errors on which the verdict is based.
+        tolerance: largest acceptable rms on held-out poses [m]; None if not stated.
+        arm: name of the deliverable if there are several; otherwise empty.
+        findings: findings on these errors.
     """
     if tolerance is not None:
         return Verdict.of(_figures(worst, arm, tolerance), findings)
@@ -168,7 +174,13 @@ def _frames_verdict(worst: _Proof, tolerance: float | None, arm: str, findings: 
 
 
 def _figures(worst: _Proof, arm: str, tolerance: float | None = None) -> str:
-    """Return a sentence with the errors of the nominal and the calibrated arm on which a verdict is based."""
+    """Return a sentence with the errors of the nominal and the calibrated arm on which a verdict is based.
+
+    Args:
+        worst: the errors on which the verdict is based.
+        arm: name of the deliverable if there are several; otherwise empty.
+        tolerance: largest acceptable rms on held-out poses [m]; None if not stated.
+    """
     figures = finding("errors", after=worst.after, before=worst.before, where=worst.where, arm=arm, tolerance=tolerance)
     return sentence(figures)
 
@@ -179,6 +191,12 @@ def _far_off(
     """Yield findings on large errors: of both arms (moved instrument or another robot), or above the tolerance.
 
     Position errors are those in `proofs`; orientation errors are those of all `sets` of rows.
+
+    Args:
+        proofs: rms position errors on which the verdict is based.
+        sets: name of a set of rows -> errors, of which orientation errors are used.
+        tolerance: largest acceptable rms position error [m]; None if not stated.
+        reach: reach of the arm [m].
     """
     for proof in proofs:
         if proof.rows is not None:
@@ -196,8 +214,13 @@ def _far_off(
 
 
 def _gross(proof: _Proof, reach: float) -> Iterator[Finding]:
-    """Yield a finding if a few rows with large errors of both arms, which are probably wrong measurements, dominate the
-    rms.
+    """Yield a finding if a few rows with large errors of both arms dominate the rms.
+
+    These rows are probably wrong measurements.
+
+    Args:
+        proof: the errors.
+        reach: reach of the arm [m].
     """
     if proof.rows is None:
         return
@@ -212,7 +235,7 @@ def _gross(proof: _Proof, reach: float) -> Iterator[Finding]:
 
 
 def _far_above_median(sizes: np.ndarray) -> np.ndarray:
-    """Return flags (m,): whether each of m errors is far above the median error."""
+    """Return flags (m,): whether each of m errors `sizes` [m] is above `OUTLIER_SIGMAS` times the median error."""
     return sizes > OUTLIER_SIGMAS * np.median(sizes)
 
 
@@ -233,10 +256,13 @@ def _row_texts(comparison: Comparison, selected: np.ndarray) -> list[str]:
 
 
 def _nothing_gained(proofs: Sequence[_Proof], findings: Findings) -> list[Finding]:
-    """Return a finding if the calibrated arm is as good as the nominal one, since there is nothing to gain or no better
-    model.
+    """Return a finding if the calibrated arm is as good as the nominal one; otherwise an empty list.
 
-    Otherwise, the list is empty.
+    The finding states that there is nothing to gain, or that no better model was found.
+
+    Args:
+        proofs: errors on which the verdict is based.
+        findings: warnings and notes on the fit.
     """
     if not proofs:
         return []
@@ -255,7 +281,12 @@ def _nothing_gained(proofs: Sequence[_Proof], findings: Findings) -> list[Findin
 
 
 def _worse(proofs: Sequence[_Proof], reach: float) -> list[Finding]:
-    """Return findings if the calibrated arm is worse than the nominal one; otherwise an empty list."""
+    """Return findings if the calibrated arm is worse than the nominal one; otherwise an empty list.
+
+    Args:
+        proofs: errors on which the verdict is based.
+        reach: reach of the arm [m].
+    """
     rules = [finding("worse-than-nominal", times=proof.ratio) for proof in proofs]
     worse = list(filter(level_of, rules))
     if worse and proofs[0].rows is None and proofs[0].after <= FLOOR * reach < np.inf:
@@ -270,8 +301,16 @@ def _doubts(
     unseen: Mapping[str, Comparison],
     findings: Findings,
 ) -> Iterator[Finding]:
-    """Yield the findings of the last group of rules: no transfer to held-out rows, narrow intervals, small gain,
-    outliers.
+    """Yield the findings of the last group of rules: doubts about the calibrated arm.
+
+    They are on missing transfer to held-out rows, narrow intervals, small gain, and outliers.
+
+    Args:
+        worst: the largest errors on which the verdict is based.
+        fitted_rms: rms error on the fitted rows [m].
+        cross_validated: cross-validated error [m]; None if not computed.
+        unseen: name of a validation file -> errors of both arms.
+        findings: warnings and notes on the fit.
     """
     times = worst.after / max(fitted_rms, TINY)
     remedy = ""
@@ -421,7 +460,14 @@ def assess(arms: Arms, inputs: Inputs, findings: Findings, weighing: Settings, s
 
 
 def _references(name: str, rows: Comparison, deliverable: str, frames_only: bool) -> Iterator[Finding]:
-    """Yield findings on validation rows that compare the deliverable with the nominal arm and the plain reference."""
+    """Yield findings on validation rows that compare the deliverable with the nominal arm and the plain reference.
+
+    Args:
+        name: name of the validation file.
+        rows: errors on its rows.
+        deliverable: ``urdf`` or ``corrections``.
+        frames_only: whether only base and tool placement were fitted; then the plain reference is no measure.
+    """
     if rows.plain is None or not rows.proves:
         return
     delivered = rows.errors[1].rms
@@ -437,7 +483,14 @@ def _references(name: str, rows: Comparison, deliverable: str, frames_only: bool
 def judge_deliverables(
     fit: Comparison, validation: Mapping[str, Comparison], findings: Findings, settings: FitSettings
 ) -> dict[str, Verdict]:
-    """Return the verdict on each deliverable: ``urdf`` (robot.urdf alone), and, if fitted, ``corrections``."""
+    """Return the verdict on each deliverable: ``urdf`` (robot.urdf alone), and, if fitted, ``corrections``.
+
+    Args:
+        fit: errors of both arms on the fitted rows.
+        validation: name of a validation file -> errors of both arms.
+        findings: warnings and notes on the fit.
+        settings: the requested model and tolerance.
+    """
     model = settings.model or "auto"
     judge_arm = partial(judge, findings=findings, requested_model=model, tolerance=settings.tolerance)
     if fit.alone is None:
@@ -451,10 +504,14 @@ def judge_deliverables(
 
 
 def _worst_rms(validation: Mapping[str, Comparison], findings: Findings, deliverable: str) -> float:
-    """Return the largest rms error [m] of a deliverable on validation rows; without such rows, the cross-validated
-    error.
+    """Return the largest rms error [m] of a deliverable on validation rows.
 
-    NaN if neither is known.
+    Without such rows, it is the cross-validated error; NaN if neither is known.
+
+    Args:
+        validation: name of a validation file -> errors of both arms.
+        findings: findings on the fit with the cross-validated errors.
+        deliverable: ``urdf`` or ``corrections``.
     """
     comparisons = [rows for rows in validation.values() if rows.proves]
     cross_validated = findings.cross_validated
@@ -469,7 +526,11 @@ def _worst_rms(validation: Mapping[str, Comparison], findings: Findings, deliver
 
 
 def _copies(inputs: Inputs) -> list[str]:
-    """Return a text for each validation file that contains fitted rows."""
+    """Return a text for each validation file that contains fitted rows.
+
+    Args:
+        inputs: robot and measurements.
+    """
     notes = []
     for name, unseen in inputs.unseen.items():
         if not unseen.seen:

@@ -35,7 +35,7 @@ DISPLACEMENT = 2e-5
 TURN = 2e-5
 ASSUMED = (
     f"predicted σ: for corner noise of {CORNER:g} px and a repeatability of {1e3 * DISPLACEMENT:g} mm and "
-    f"{1e3 * TURN:g} mrad per axis; unmodelled effects come on top"
+    f"{1e3 * TURN:g} mrad per axis; unmodelled effects are not included"
 )
 # times that views are drawn
 TRIES = 60
@@ -56,8 +56,9 @@ FREE_LENS_PARAMETERS = 8
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """Constraint "the camera sees the whole board": function of q (m, n) with values (m, 19), satisfied where all are
-    <= 0.
+    """Constraint "the camera sees the whole board", satisfied where all values are <= 0.
+
+    It is a function of joint values q (m, n) with values (m, 19).
 
     Attributes:
         cell: the arm with approximate placements of camera and board.
@@ -208,7 +209,12 @@ class CameraView:
         return result[:count]
 
     def _views(self, count: int, stream: np.random.Generator) -> np.ndarray:
-        """Return random poses (count, 4, 4) of the board in the camera frame, at allowed distance and tilt."""
+        """Return random poses (count, 4, 4) of the board in the camera frame, at allowed distance and tilt.
+
+        Args:
+            count: number of poses.
+            stream: generator of the random numbers.
+        """
         azimuth = stream.uniform(-np.pi, np.pi, count)
         tilt = self.tilt * np.sqrt(stream.uniform(0.0, 1.0, count))
         axis = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.zeros(count)])
@@ -222,11 +228,11 @@ class CameraView:
 
 @dataclass(frozen=True, eq=False)
 class ImageObservation(Observation):
-    """Whitened observation Jacobian of images: function of q (m, n) with values (m, rows, p), for p identifiable
-    parameters.
+    """Whitened observation Jacobian of images, as a function of joint values.
 
-    The corners of one image are condensed to their information on the board's pose and the lens. The assumed noise of
-    corners and of the arm's repeatability is our choice (`CORNER`, `DISPLACEMENT`, `TURN`).
+    It maps q (m, n) to the derivatives (m, rows, p) of the measured quantities, divided by their noise, by p
+    identifiable parameters. The corners of one image are condensed to their information on the board's pose and the
+    lens. The assumed noise of corners and of the arm's repeatability is our choice (`CORNER`, `DISPLACEMENT`, `TURN`).
 
     Attributes:
         view: placements of camera and board.
@@ -237,7 +243,13 @@ class ImageObservation(Observation):
     product = None  # type: ignore[assignment]
 
     def position(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the position (m, 3) [m] of the carried camera or board, and its unwhitened Jacobian (m, 3, p)."""
+        """Return the position (m, 3) [m] of the carried camera or board, and its Jacobian (m, 3, p).
+
+        The Jacobian is not divided by the measurement noise.
+
+        Args:
+            q: (m, n) joint values [rad or m].
+        """
         target = see(self.cell, q, -1)
         columns = target_jacobian(self.cell, target, self.free, -1, np.zeros(len(q), dtype=int))
         return target.point.T, columns[:, :3].transpose(2, 1, 0)
@@ -262,7 +274,7 @@ def camera_view(table: CameraTable, chain: Chain, where: str, folder: Path) -> C
         UsageError, MeasurementError, RobotError: for a missing file or an invalid placement.
     """
     for name in (table.lens, table.board):
-        require((folder / name).is_file(), f"{where}: camera: no file '{name}' next to it", UsageError)
+        require((folder / name).is_file(), f"{where}: camera: no file '{name}' next to it: copy it there", UsageError)
     if not table.range[0] < table.range[1]:
         raise UsageError(f"{where}: camera.range: {table.range[0]:g} is not below {table.range[1]:g}")
     lens = read_lens(folder / table.lens)

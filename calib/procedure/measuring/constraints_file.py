@@ -99,7 +99,11 @@ _SPAN_OR_MARGIN = {"anyOf": [_PAIR, {"type": ["number", "string"]}]}
 
 
 def _directions(value: object) -> object:
-    """Return a list of directions; a single direction or an axis name becomes a list of one direction."""
+    """Return a list of directions; a single direction or an axis name becomes a list of one direction.
+
+    Args:
+        value: a direction (3 numbers), the name of an axis such as ``-x``, or a list of these.
+    """
     if isinstance(value, str):
         value = AXES.get(value, value)
     if isinstance(value, list | tuple) and len(value) > 0 and not isinstance(value[0], list | tuple):
@@ -122,7 +126,7 @@ class TargetTable:
 
     def __post_init__(self) -> None:
         if not self.facing or not all(map(np.any, self.facing)):
-            raise ValueError("facing: [0, 0, 0] is not a direction")
+            raise ValueError("facing: [0, 0, 0] is not a direction; state one such as [0, 0, 1]")
         if isinstance(self.height, tuple):
             rising(self.height, "height")
 
@@ -265,6 +269,11 @@ def beside(path: Path) -> dict[str, Path]:
 
 
 def rising(span: tuple[float, ...], where: str) -> None:
-    """Raise a ValueError unless a range consists of two numbers with the lower one first."""
+    """Raise a ValueError unless a range consists of two numbers with the lower one first.
+
+    Args:
+        span: the range.
+        where: name of the key for the message.
+    """
     require(len(span) == 2, f"{where}: expected a list of 2 numbers, lower and upper, found {len(span)}", ValueError)
     require(span[0] < span[1], f"{where}: {span[0]:g} is not below {span[1]:g}", ValueError)

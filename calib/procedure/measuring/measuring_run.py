@@ -29,7 +29,7 @@ from calib import files
 from calib.data.poses.pose_lists import joint_columns
 from calib.poses.by_index import merits
 from calib.poses.indices import Index, observability
-from calib.poses.information import log_det
+from calib.poses.scaled_jacobians import log_det
 from calib.procedure.measuring import DEFAULT_RUN, RunSettings
 from calib.robot.chain import Chain
 from calib.trajectories.tour import move_times, tour
@@ -100,7 +100,7 @@ class MoveLimits(Protocol):
 
 
 def _silent(stage: str) -> None:
-    """Ignore a progress text."""
+    """Ignore a progress text, `stage`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,6 +245,11 @@ def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray)
     moves short, the interval begins in the middle of the largest gap between the poses' angles if this gap exceeds 30°;
     otherwise half a turn below the middle of the joint's range. An angle that would leave the joint limits remains
     unchanged.
+
+    Args:
+        chain: the arm.
+        q: the poses [rad or m].
+        lower, upper: (n,) joint limits [rad or m].
     """
     full = 2 * np.pi
     result = q.copy()
@@ -266,8 +271,13 @@ def same_turn(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray)
 
 
 def _joined(clear: Ways, cost: np.ndarray) -> tuple[np.ndarray, Ways]:
-    """Return the fastest order of the poses and the paths between consecutive poses, which may lead through other
-    poses.
+    """Return the fastest order of the poses and the paths between consecutive poses.
+
+    A path may lead through other poses.
+
+    Args:
+        clear: collision-free paths: indices of two poses -> path between them.
+        cost: (m, m) durations of the moves between the poses [s].
     """
     from scipy.sparse.csgraph import shortest_path  # slow to load
 
@@ -296,7 +306,13 @@ def _joined(clear: Ways, cost: np.ndarray) -> tuple[np.ndarray, Ways]:
 
 
 def turns(chain: Chain, q: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return all postures (k, n) within joint limits that differ from q (n,) by whole turns of revolute joints."""
+    """Return all postures (k, n) within joint limits that differ from q (n,) by whole turns of revolute joints.
+
+    Args:
+        chain: the arm.
+        q: the posture [rad or m].
+        lower, upper: (n,) joint limits [rad or m].
+    """
     values = []
     for j, joint in enumerate(chain.joints):
         positions = q[j : j + 1]
@@ -351,6 +367,10 @@ def _clear_at_places(room: Room, q: np.ndarray) -> np.ndarray:
     """Return (m, m) flags: whether the straight move between two poses is collision-free at `PLACES` samples.
 
     The flags are an estimate that is used only to order the poses.
+
+    Args:
+        room: joint limits and the test for collision.
+        q: (m, n) poses [rad or m].
     """
     start, end = np.triu_indices(len(q), 1)
     share = ((np.arange(PLACES) + 0.5) / PLACES)[:, None, None]
@@ -362,7 +382,12 @@ def _clear_at_places(room: Room, q: np.ndarray) -> np.ndarray:
 
 
 def lines(run: MeasuringRun, settings: RunSettings) -> list[str]:
-    """Return lines of text on a run: duration, paths with via-points, and moves without a collision-free path."""
+    """Return lines of text on a run: duration, paths with via-points, and moves without a collision-free path.
+
+    Args:
+        run: the run.
+        settings: its speed and dwell time.
+    """
     minutes, before = run.seconds / 60, run.found / 60
     result = [
         f"run: {len(run.order)} poses in {minutes:.1f} min at {settings.speed:.0%} of the joints' speed, "
@@ -377,8 +402,14 @@ def lines(run: MeasuringRun, settings: RunSettings) -> list[str]:
 
 
 def write_run(path: Path, run: MeasuringRun, chain: Chain) -> Path:
-    """Write a run as a CSV file with poses numbered in the order of the visits; the module's docstring states the
-    columns.
+    """Write a run as a CSV file with poses numbered in the order of the visits.
+
+    The module's docstring states the columns.
+
+    Args:
+        path: path of the file.
+        run: the run.
+        chain: the arm, which names the joints.
 
     Returns:
         Path of the file.
@@ -423,6 +454,11 @@ def _room(chain: Chain, limits: MoveLimits, velocity: np.ndarray) -> Room:
 
     A path is free if the distance between parts is at least half the clearance at samples that are at most one
     clearance apart. Without a collision model, every posture is free.
+
+    Args:
+        chain: the arm.
+        limits: joint limits, collision model and clearance.
+        velocity: (n,) joint speeds of the run [rad/s or m/s], by which distances in joint space are measured.
     """
     model, clearance = limits.collision, limits.clearance
     reach = np.array([chain.stretched_length() if joint.kind == "revolute" else 1.0 for joint in chain.joints])
@@ -441,10 +477,11 @@ class Exchange:
     """Candidate poses that may replace unreachable ones, and the observability index that ranks the candidates.
 
     Attributes:
-        jacobian: function q (m, n) -> whitened observation Jacobians (m, rows, p).
+        jacobian: function q (m, n) -> whitened observation Jacobians (m, rows, p): derivatives of the measured
+            quantities by p parameters, divided by the noise.
         candidates: (N, n) feasible poses [rad or m].
         before: (k, rows, p) Jacobians of poses measured earlier; None: no earlier poses.
-        index: observability index that ranks the candidates.
+        index: name of the observability index that ranks the candidates.
     """
 
     jacobian: Callable[[np.ndarray], np.ndarray]
@@ -453,8 +490,9 @@ class Exchange:
     index: Index
 
     def value(self, q: np.ndarray) -> tuple[float, float]:
-        """Return the observability index and log det(WᵀW) / p of poses q (m, n) together with the poses measured
-        earlier.
+        """Return the observability index and log det(WᵀW) / p of poses q (m, n) and the poses measured earlier.
+
+        W is the observation matrix that stacks the Jacobians of all these poses, p the number of parameters.
         """
         rows = self._rows(q)
         flat = rows.reshape(-1, rows.shape[2])
@@ -476,7 +514,7 @@ class Exchange:
 
     @cached_property
     def _information(self) -> np.ndarray:
-        """Information matrices WᵀW (N, p, p) of the candidates."""
+        """Information matrices WᵀW (N, p, p) of the candidates, with W the observation Jacobian of one candidate."""
         jacobians = self.jacobian(self.candidates)
         return jacobians.transpose(0, 2, 1) @ jacobians
 
@@ -496,7 +534,7 @@ class Drivable:
         run: run through the poses.
         replaced: index of a pose that no collision-free path reached -> index of the candidate that replaces it.
         value: observability index before and after the replacements.
-        gain: change of log det(WᵀW) / p by the replacements.
+        gain: change, by the replacements, of log det(WᵀW) / p, with W the observation matrix of the poses.
     """
 
     q: np.ndarray
@@ -507,8 +545,9 @@ class Drivable:
 
     @property
     def words(self) -> str:
-        """Sentence for the user on the replaced poses, numbered from 1 in the order of the run; empty without
-        replacements.
+        """Sentence for the user on the replaced poses, numbered from 1 in the order of the run.
+
+        Empty without replacements.
         """
         if not self.replaced:
             return ""
@@ -535,7 +574,7 @@ def drivable(
     """Return a run through poses q (m, n) in which candidates replace the poses without a collision-free path.
 
     Args:
-        chain, limits, settings, seed, progress: see `calib.procedure.measuring.measuring_run.plan_run`.
+        chain, limits, settings, seed, progress: as for `plan_run`.
         q: the poses [rad or m].
         exchange: candidate poses that may replace unreachable ones.
     """
@@ -567,6 +606,12 @@ def _rejoined(
     seed: int,
 ) -> tuple[np.ndarray, dict[int, int], Ways]:
     """Return poses with unreachable ones replaced, the replacements, and all collision-free paths.
+
+    Args:
+        chain, limits, settings, seed: as for `plan_run`.
+        q: (m, n) the poses [rad or m].
+        run: run through the poses, which leaves out unreachable ones.
+        exchange: candidate poses that may replace unreachable ones.
 
     Returns:
         Poses (m, n) in input order, pose index -> index of the replacing candidate, and paths by pair of pose indices.

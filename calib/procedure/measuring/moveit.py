@@ -40,10 +40,13 @@ TABLES = {"velocity": "velocity", "acceleration": "acceleration", "jerk": "jerk"
 
 
 def moveit_files(path: Path) -> list[Path]:
-    """Return the ``joint_limits.yaml`` and the SRDF file at a path, which is one of these files or a folder that
-    contains them.
+    """Return the ``joint_limits.yaml`` and the SRDF file at a path.
 
-    An empty list: the path is a file of another type.
+    Args:
+        path: one of these files, or a folder that contains them.
+
+    Returns:
+        The files; an empty list if the path is a file of another type.
 
     Raises:
         UsageError: for a folder without such files, or with several SRDF files.
@@ -61,7 +64,9 @@ def moveit_files(path: Path) -> list[Path]:
     if len(srdf) > 1:
         raise UsageError(f"{path} has {len(srdf)} SRDF files: give one of them, as {srdf[0]}")
     if not limits and not srdf:
-        raise UsageError(f"{path}: neither {JOINT_LIMITS} nor *{SRDF} in this folder or its config")
+        raise UsageError(
+            f"{path}: neither {JOINT_LIMITS} nor *{SRDF} in this folder or its config folder: give the MoveIt package"
+        )
     return [*limits[:1], *srdf]
 
 
@@ -86,7 +91,13 @@ def limit_tables(path: Path, chain: Chain, source: Path | None) -> ParsedTable |
 
 
 def _limits(path: Path, chain: Chain, source: Path | None) -> ParsedTable:
-    """Return the limits of a ``joint_limits.yaml`` as tables ``[joints]``, ``[velocity]`` … of a limits file."""
+    """Return the limits of a ``joint_limits.yaml`` as tables ``[joints]``, ``[velocity]`` … of a limits file.
+
+    Args:
+        path: the ``joint_limits.yaml``.
+        chain: the arm.
+        source: file of the arm; None: joints outside the arm are not known.
+    """
     content = _yaml(path)
     entries = None
     if isinstance(content, dict):
@@ -117,7 +128,11 @@ def _limits(path: Path, chain: Chain, source: Path | None) -> ParsedTable:
         if upper is None:
             upper = joint.upper
         tables.setdefault("joints", {})[joint.name] = [lower, upper]
-    require(tables, f"{path}: limits no joint of the arm ({', '.join(chain.joint_names)})", UsageError)
+    require(
+        tables,
+        f"{path}: limits no joint of the arm ({', '.join(chain.joint_names)}): is it for another robot?",
+        UsageError,
+    )
     return tables
 
 
@@ -125,6 +140,12 @@ def _limit(limits: Mapping[str, object], quantity: str, end: str, where: str) ->
     """Return a joint's limit in MoveIt's unit; None if the file does not state it or disables it.
 
     A limit is disabled by ``has_..._limits: false``.
+
+    Args:
+        limits: the joint's entry in ``joint_limits.yaml``.
+        quantity: ``position``, ``velocity``, ``acceleration``, ``jerk`` or ``effort``.
+        end: ``min`` or ``max``.
+        where: name of the entry for messages.
     """
     key = f"{end}_{quantity}"
     if not limits.get(f"has_{quantity}_limits", True) or key not in limits:
@@ -152,8 +173,14 @@ def _yaml(path: Path) -> object:
 
 
 def _pairs(path: Path, chain: Chain, source: Path | None) -> ParsedTable:
-    """Return the table ``[collision]`` for an SRDF: the pairs of existing links between which collisions are not
-    checked.
+    """Return the table ``[collision]`` for an SRDF: the pairs of links whose collisions are not checked.
+
+    Pairs with links that do not exist are omitted.
+
+    Args:
+        path: the SRDF.
+        chain: the arm.
+        source: file of the arm; None: links outside the arm are not known.
     """
     with refused_as(UsageError, (OSError, UnicodeDecodeError), f"{path}: cannot be read: {{}}"):
         root = parse(path.read_text(encoding="utf-8"), str(path))
@@ -163,7 +190,7 @@ def _pairs(path: Path, chain: Chain, source: Path | None) -> ParsedTable:
     ignored = [list(pair) for pair in pairs if {*pair} <= links]
     if pairs and not ignored:
         raise UsageError(
-            f"{path}: none of its {len(pairs)} disabled pairs is of links of {chain.name}, as {shown(pairs[:1])}: "
-            "is it another robot's?"
+            f"{path}: none of its {len(pairs)} disabled pairs has links of {chain.name}, e.g. {shown(pairs[:1])}: "
+            "is it for another robot?"
         )
     return {"ignored": ignored}

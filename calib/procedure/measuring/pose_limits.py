@@ -20,7 +20,7 @@ from calib.config_types import number
 from calib.errors import RobotError, UsageError, listing, one_of, refused_as, require
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, TargetJacobian, TargetPose
-from calib.poses import constraints
+from calib.poses import pose_constraints
 from calib.poses.space import PoseConstraint, SearchSpace
 from calib.procedure.measuring import constraints_file
 from calib.procedure.measuring.camera_view import camera_view
@@ -125,9 +125,10 @@ def read_limits(
     Args:
         tables: path of the file, or its content as tables; tables for motions (`MOTION`) are ignored; None: only
             defaults apply.
-        cell: the arm with its targets, see `calib.geometry.observability.targets_of`.
+        cell: the arm with its targets, as `calib.geometry.observability.targets_of` returns it.
         source: the robot's file; if it is a URDF, its collision shapes are used; None: no file.
-        without: names of `DEFAULTS` that do not apply, and names of `CELL` objects that do not exist.
+        without: defaults that do not apply (self-collision, floor, joint-margin, view), and objects that the cell does
+            not have (instrument, box, obstacles).
 
     Raises:
         UsageError: for an unknown key or an invalid value.
@@ -171,6 +172,14 @@ def _with_camera(
     """Return the limits with the camera's view of the board added.
 
     If the placement or the files of camera or board are unknown, the view is instead listed as unchecked.
+
+    Args:
+        limits: the other limits.
+        camera: table ``[camera]`` of the constraints file.
+        cell: the arm with its targets.
+        where: name of the constraints file for messages.
+        folder: folder with the lens file and the board file.
+        absent: names of defaults and objects that do not apply, such as ``view``.
     """
     unchecked = tuple(name for name in limits.unchecked if not name.startswith("line of sight"))
     if camera.unknown:
@@ -206,7 +215,8 @@ def limits_of(
         cell: the arm with its targets.
         source: the robot's file; if it is a URDF, its collision shapes are used; None: no file.
         where: name of the constraints file for messages.
-        without: names of `DEFAULTS` that do not apply, and names of `CELL` objects that do not exist.
+        without: defaults that do not apply (self-collision, floor, joint-margin, view), and objects that the cell does
+            not have (instrument, box, obstacles).
         measured: True for poses at which an instrument measures; False for motions, which need no line of sight.
 
     Raises:
@@ -245,7 +255,13 @@ def limits_of(
 
 
 def _unchecked(settings: ConstraintsFile, absent: set[str], measured: bool) -> tuple[str, ...]:
-    """Return the names of the limits that are not checked, for measured poses (`measured`) or for motions."""
+    """Return the names of the limits that are not checked.
+
+    Args:
+        settings: content of the constraints file.
+        absent: defaults and objects that do not apply, such as ``floor`` or ``instrument``.
+        measured: True for poses at which an instrument measures; False for motions.
+    """
     instrument = settings.instrument or InstrumentTable()
     collision = settings.collision or CollisionTable()
     placed = bool(instrument.stated)
@@ -273,7 +289,15 @@ def _joint_margin(spans: Mapping[str, object], where: str) -> float:
 def _joints(
     spans: Mapping[str, object], cell: Installation, where: str, margin: float
 ) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Return lower and upper joint limits (n,) [rad or m], and notes for the user on suspicious ranges in the file."""
+    """Return lower and upper joint limits (n,) [rad or m], and notes for the user on ranges in the file without effect
+    or in the wrong unit.
+
+    Args:
+        spans: table ``[joints]``: joint name -> range.
+        cell: the arm.
+        where: name of the constraints file for messages.
+        margin: share of each joint's range that stays free at either end.
+    """
     chain = cell.chain
     lower, upper = (limit.copy() for limit in chain.sampling_limits())
     limited = np.isfinite(chain.lower) & np.isfinite(chain.upper)
@@ -322,11 +346,11 @@ def _target(settings: ConstraintsFile, cell: Installation) -> list[PoseConstrain
     result = []
     low, high = table.heights
     if low is not None:
-        result.append(constraints.height(target, low, np.inf if high is None else high, jacobian))
+        result.append(pose_constraints.height(target, low, np.inf if high is None else high, jacobian))
     if table.axis_distance is not None:
-        result.append(constraints.axis_distance(target, table.axis_distance, jacobian))
+        result.append(pose_constraints.axis_distance(target, table.axis_distance, jacobian))
     if table.reach is not None:
-        result.append(constraints.reach(target, table.reach, jacobian=jacobian))
+        result.append(pose_constraints.reach(target, table.reach, jacobian=jacobian))
     return result
 
 
@@ -337,7 +361,7 @@ def _orientation(settings: ConstraintsFile, cell: Installation, where: str) -> l
     stand = placement(table.stated, where)
     roll = _span(table.roll or (-np.pi, np.pi), f"{where}.roll", "angle")
     pitch = _span(table.pitch or (-np.pi / 2, np.pi / 2), f"{where}.pitch", "angle")
-    return [constraints.orientation(TargetPose(cell), stand[:3, :3], roll, pitch, TargetJacobian(cell))]
+    return [pose_constraints.orientation(TargetPose(cell), stand[:3, :3], roll, pitch, TargetJacobian(cell))]
 
 
 def _sight(settings: ConstraintsFile, cell: Installation, where: str, model: DistanceModel | None) -> Sight | None:
@@ -345,6 +369,12 @@ def _sight(settings: ConstraintsFile, cell: Installation, where: str, model: Dis
 
     None if the file states no instrument or no condition on its lines of sight. An instrument for which only roll and
     pitch are stated is a camera; the two ranges limit the target's orientation in its image.
+
+    Args:
+        settings: content of the constraints file.
+        cell: the arm with its targets.
+        where: name of the constraints file for messages.
+        model: collision model of the arm's links; None: links in between are not checked.
     """
     table, facing = settings.instrument, settings.target.facing
     if table is None:
@@ -365,7 +395,15 @@ def _sight(settings: ConstraintsFile, cell: Installation, where: str, model: Dis
 def _collision(
     settings: ConstraintsFile, cell: Installation, source: Path | None, where: str, absent: set[str]
 ) -> tuple[DistanceModel, tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-    """Return the collision model, the names of the checked collisions, notes, and the names of unchecked collisions."""
+    """Return the collision model, the names of the checked collisions, notes, and the names of unchecked collisions.
+
+    Args:
+        settings: content of the constraints file.
+        cell: the arm with its targets.
+        source: the robot's file, with collision shapes if it is a URDF; None: no file.
+        where: name of the constraints file for messages.
+        absent: names of defaults and objects that do not apply.
+    """
     table = settings.collision or CollisionTable()
     floor = table.floor
     if floor is None and "floor" not in absent:
@@ -410,6 +448,13 @@ def _never_act(
 ) -> tuple[set[str], tuple[str, ...]]:
     """Return the names of walls and obstacles that the arm cannot reach, and one note on each.
 
+    Args:
+        table: table ``[collision]`` of the constraints file.
+        obstacles: the obstacles.
+        walls: floor and walls.
+        cell: the arm with its targets.
+        where: name of the constraints file for messages.
+
     Raises:
         UsageError: for a wall or obstacle further away than `MAX_REACHES` times the arm's reach, and for a link radius
             above the reach.
@@ -450,7 +495,17 @@ def _model(
     self_collision: bool,
     floor: float | None,
 ) -> tuple[DistanceModel, str, tuple[str, ...], tuple[str, ...]]:
-    """Return the collision model, a text on the link shapes, notes, and the links that the model does not contain."""
+    """Return the collision model, a text on the link shapes, notes, and the links that the model does not contain.
+
+    Args:
+        cell: the arm with its targets.
+        source: the robot's file, with collision shapes if it is a URDF; None: no file.
+        table: table ``[collision]`` of the constraints file.
+        obstacles: the obstacles.
+        walls: floor and walls.
+        self_collision: whether collisions between links are checked.
+        floor: height of the floor in the arm's base frame [m]; None: no floor.
+    """
     from calib.robot import capsules, collision
     from calib.robot.beside import links_beside
 
@@ -507,6 +562,11 @@ def _model(
 def _posture(values: Mapping[str, object], chain: Chain, source: Path | None) -> dict[str, float]:
     """Return the joint values [rad or m] of joints outside the arm: joint name -> value.
 
+    Args:
+        values: joint name -> value in the constraints file; joints that it does not name are at zero.
+        chain: the arm.
+        source: the robot's file; None: no file.
+
     Raises:
         RobotError: for a joint of the arm, or a joint that is not in the robot's URDF.
     """
@@ -527,9 +587,14 @@ def _posture(values: Mapping[str, object], chain: Chain, source: Path | None) ->
 
 
 def _description(source: Path | None, chain: Chain) -> Path | None:
-    """Return the path of the arm's URDF: the source itself, or the URDF from which a fit's ``robot.toml`` was made.
+    """Return the path of the arm's URDF; None if it is not found.
 
-    The URDF of a fit is searched at the path stored in ``robot.toml`` and in the session's folder. None: not found.
+    It is the source itself, or the URDF from which a fit's ``robot.toml`` was made. The URDF of a fit is searched at
+    the path stored in ``robot.toml`` and in the session's folder.
+
+    Args:
+        source: the robot's file; None: no file.
+        chain: the arm, whose links the URDF must contain.
     """
     if source is None or is_urdf(source):
         return source
@@ -547,7 +612,12 @@ def _description(source: Path | None, chain: Chain) -> Path | None:
 
 
 def _walls(box: tuple[tuple[object, object], ...] | None, where: str) -> list[Wall]:
-    """Return the two walls perpendicular to each axis of a box; an empty list without a box."""
+    """Return the two walls perpendicular to each axis of a box; an empty list without a box.
+
+    Args:
+        box: ranges along x, y and z in the arm's base frame [m]; None: no box.
+        where: name of the box for messages.
+    """
     walls = []
     for axis, normal, span in zip("xyz", np.eye(3), box or ()):
         low, high = _span(span, f"{where}: {axis}", "length")

@@ -22,7 +22,7 @@ from calib.geometry.weighing import GeometricFit
 from calib.poses.design import Pool
 from calib.poses.errors import NotIdentifiable, TooFewCandidates
 from calib.poses.exchange import greedy
-from calib.poses.information import prepared
+from calib.poses.scaled_jacobians import prepared
 from calib.records import Array, read_json
 
 SUFFIX = "_prediction.json"
@@ -60,7 +60,7 @@ class SelectionPrediction:
             selection_joints = ", ".join(self.joints)
             raise UsageError(
                 f"the selection belongs to another robot: its joints are {selection_joints}; "
-                f"this robot has {', '.join(joints)}"
+                f"this robot has {', '.join(joints)}: choose poses for it"
             )
 
 
@@ -83,8 +83,9 @@ class Prediction(SelectionPrediction):
 
     @property
     def worst(self) -> float:
-        """95 % quantile over typical poses of the σ of the tool's position [m]; infinite if a parameter is not
-        identifiable.
+        """95 % quantile over typical poses of the σ of the tool's position [m].
+
+        Infinite if a parameter is not identifiable.
         """
         if not np.isfinite(self.spread).all():
             return float("inf")
@@ -98,7 +99,8 @@ def predicted(
 
     Args:
         observation: observation Jacobian with which the Jacobians were computed.
-        jacobians: (m, rows, p) whitened Jacobians of all poses to be fitted, including those measured earlier.
+        jacobians: (m, rows, p) Jacobians, divided by the measurement noise, of all poses to be fitted, including those
+            measured earlier.
         typical: (s, n) joint values at which the tool's accuracy is predicted [rad or m].
         poses: number of poses stated in the result; None: m.
     """
@@ -133,11 +135,12 @@ def by_count(
 ) -> tuple[Prediction, ...]:
     """Return the predicted accuracy for each number of poses in `COUNTS`, with poses chosen greedily.
 
-    Numbers above N and numbers that do not identify all parameters are left out; the result may be empty.
+    Numbers above the number N of candidates, and numbers that do not identify all parameters, are left out; the result
+    may be empty.
 
     Args:
         observation: observation Jacobian with which the Jacobians were computed.
-        candidates: (N, rows, p) whitened Jacobians of the candidate poses.
+        candidates: (N, rows, p) Jacobians of the candidate poses, divided by the measurement noise.
         typical: (s, n) joint values at which the tool's accuracy is predicted [rad or m].
         before: (k, rows, p) Jacobians of poses measured earlier; None: no earlier poses.
     """
@@ -161,13 +164,16 @@ def by_count(
 
 
 def table(prediction: Prediction, by_pose_count: tuple[Prediction, ...]) -> list[tuple[str, str]]:
-    """Return table rows (label, text): σ of the tool's position and of the parameters, and σ for other numbers of
-    poses.
+    """Return table rows (label, text) on the predicted σ of the tool's position and of the parameters.
+
+    Args:
+        prediction: prediction for the selected poses.
+        by_pose_count: predictions for other numbers of poses, of which the σ of the tool's position is listed.
     """
     label = "predicted σ of the tool's position"
     if not np.isfinite(prediction.rms):
         return [(label, "not available: these poses do not identify all parameters")]
-    rows = [(label, f"{1e3 * prediction.rms:.3g} mm rms, {1e3 * prediction.worst:.3g} mm at 95 %")]
+    rows = [(label, f"{1e3 * prediction.rms:.3g} mm rms, {1e3 * prediction.worst:.3g} mm at 95 %, by noise alone")]
     sigmas = []
     for unit, quantity, printed_unit in QUANTITIES:
         indices = [k for k, parameter_unit in enumerate(prediction.units) if parameter_unit == unit]
@@ -187,7 +193,7 @@ def table(prediction: Prediction, by_pose_count: tuple[Prediction, ...]) -> list
 
 
 def beside(poses: Path) -> Path:
-    """Return the path of the file with the prediction for a CSV of selected poses."""
+    """Return the path of the file with the prediction for `poses`, the CSV of selected poses."""
     return poses.parent / (poses.stem + SUFFIX)
 
 

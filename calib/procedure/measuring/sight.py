@@ -14,7 +14,7 @@ import numpy as np
 
 from calib.geometry.installation import Installation
 from calib.geometry.observability import Observation, TargetJacobian, TargetPose
-from calib.poses import constraints
+from calib.poses import pose_constraints
 from calib.poses.space import PoseConstraint, constraint_gradient
 from calib.robot.capsules import ALWAYS, SAMPLES
 from calib.robot.chain import Chain, random_joints
@@ -35,7 +35,8 @@ class _Behind:
     """Constraint that keeps links off a line of sight: `BEAM` minus the distances of the `DISTANCES` nearest links [m].
 
     Attributes:
-        arm: collision model with a method ``beam``, see `calib.robot.capsules.Capsules.beam`.
+        arm: collision model with a method ``beam`` (distances of links from a line of sight), see
+            `calib.robot.capsules.Capsules.beam`.
         target: pose of the target as a function of q.
         velocity: Jacobian of the target's pose as a function of q.
         instrument: (3,) position of the instrument in the arm's base frame [m].
@@ -72,7 +73,7 @@ class Sight:
     """The lines of sight from an instrument to the targets of an arm.
 
     Attributes:
-        targets: for each target, the constraints that must be satisfied for the instrument to see it.
+        targets: for each target, the constraints that must all be satisfied for the instrument to see it.
     """
 
     targets: tuple[tuple[PoseConstraint, ...], ...]
@@ -88,7 +89,11 @@ class Sight:
         return self._values(q).max(axis=2) <= SEEN
 
     def _values(self, q: np.ndarray) -> np.ndarray:
-        """Return the constraint values (m, T, k) of each of T targets; a target is seen where all k values are <= 0."""
+        """Return the constraint values (m, T, k) of each of T targets; a target is seen where all k values are <= 0.
+
+        Args:
+            q: (m, n) joint values [rad or m].
+        """
 
         def violations(parts: Sequence[PoseConstraint]) -> np.ndarray:
             return np.concatenate([constraint.function(q) for constraint in parts], axis=1)
@@ -113,7 +118,7 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class SeenOnly:
-    """Observation Jacobian in which the rows of targets that are not seen are zero."""
+    """Observation Jacobian J in which the rows of targets that are not seen are zero."""
 
     of: Observation
     sight: Sight
@@ -122,7 +127,14 @@ class SeenOnly:
         return self.of(q) * self._mask(q)
 
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-        """Return the gradient (m, n) of Σ G · J with respect to q, with a constant set of seen targets."""
+        """Return the gradient (m, n) of Σ G · J with respect to q, for weights G and the Jacobian J (m, rows, p).
+
+        The set of seen targets is taken as constant.
+
+        Args:
+            q: (m, n) joint values [rad or m].
+            G: (m, rows, p) weights.
+        """
         return self.of.product(q, G * self._mask(q))
 
     def _mask(self, q: np.ndarray) -> np.ndarray:
@@ -160,9 +172,9 @@ def sight_of(
         velocity = TargetJacobian(cell, number)
         parts: list[PoseConstraint] = []
         if half_angle is not None:
-            parts.append(constraints.line_of_sight(target, instrument, direction, half_angle, velocity))
+            parts.append(pose_constraints.line_of_sight(target, instrument, direction, half_angle, velocity))
         if nearest > 0.0 or np.isfinite(largest):
-            parts.append(constraints.distance(target, nearest or -np.inf, largest, instrument, velocity))
+            parts.append(pose_constraints.distance(target, nearest or -np.inf, largest, instrument, velocity))
         if arm is not None:
             links = _blocking_links(arm, cell.chain, target)
             behind = _Behind(arm, target, velocity, np.asarray(instrument, dtype=float), links)
@@ -174,7 +186,13 @@ def sight_of(
 
 
 def _blocking_links(arm: DistanceModel, chain: Chain, target: TargetPose) -> np.ndarray:
-    """Return the indices of links that can block the view: all except those next to the target in every posture."""
+    """Return the indices of links that can block the view: all except those next to the target in every posture.
+
+    Args:
+        arm: model of the arm's links.
+        chain: the arm.
+        target: pose of the target as a function of the joint values.
+    """
     q = random_joints(chain, SAMPLES)
     position = target(q)[1]
     # a beam of almost no length: the distances of the links from the target itself

@@ -65,9 +65,17 @@ def line(
     label: str = "",
     spread: ArrayLike | None = None,
 ) -> None:
-    """Draw a curve or points (k,) in a matplotlib format (``-``, ``o``, ``o-``); curves with many points are thinned.
+    """Draw a curve or points (k,); curves with many points are thinned.
 
     Args:
+        axes: axes to draw on.
+        x, y: (k,) coordinates.
+        form: matplotlib format, such as ``-``, ``o`` or ``o-``.
+        colour: colour of line and points.
+        width: width of the line [pt].
+        size: size of the points [pt].
+        hollow: whether points are drawn as outlines only.
+        label: text in the legend; empty: none.
         spread: (k,) half lengths of error bars; None: no error bars.
     """
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
@@ -102,6 +110,7 @@ def bars(
     """Draw k bars from `base` to their values, at the positions 0, 1, … of the other axis.
 
     Args:
+        axes: axes to draw on.
         values: (k,) ends of the bars.
         colours: one colour for all bars, or one per bar.
         upright: whether the bars are vertical.
@@ -136,7 +145,10 @@ def level(
     """Draw a horizontal or vertical line across the panel, with a label.
 
     Args:
+        axes: axes to draw on.
         at: position of the line.
+        colour: colour of line and label.
+        form: matplotlib line style, such as ``--``.
         upright: whether the line is vertical.
         words: the label.
         height: height of a vertical line's label, as a share of the panel's height.
@@ -184,13 +196,31 @@ def text(
     across: str = "left",
     along: str = "baseline",
 ) -> None:
-    """Draw a text at a point, shifted by an offset [pt]."""
+    """Draw a text at a point, shifted by an offset.
+
+    Args:
+        axes: axes to draw on.
+        words: the text.
+        x, y: the point.
+        offset: shift to the right and upwards [pt].
+        colour: colour of the text.
+        size: font size [pt].
+        across, along: matplotlib's horizontal and vertical alignment of the text.
+    """
     axes.annotate(words, (x, y), offset, textcoords="offset points", color=colour, fontsize=size, ha=across, va=along)
 
 
 @layer
 def dots(axes: Axes, x: ArrayLike, y: ArrayLike, values: ArrayLike, least: float, most: float, unit: str = "") -> None:
-    """Draw points (k,) coloured by their values (k,) from `least` to `most`; with a `unit`, a colour bar is drawn."""
+    """Draw points (k,) coloured by their values.
+
+    Args:
+        axes: axes to draw on.
+        x, y: (k,) coordinates.
+        values: (k,) values.
+        least, most: values of the first and the last colour.
+        unit: title of the colour bar; empty: no colour bar.
+    """
     # the largest on top
     order = np.argsort(values)
     x, y, values = np.asarray(x)[order], np.asarray(y)[order], np.asarray(values)[order]
@@ -214,6 +244,7 @@ def heat(
     """Draw a colour map of values (rows, columns) with a colour bar; row 0 is at the top, and NaN is white.
 
     Args:
+        axes: axes to draw on.
         unit: title of the colour bar.
         extent: coordinates of the map's left, right, bottom and top edge; None: cell k is at coordinate k.
         limits: values of the first and the last colour; None: the largest value.
@@ -232,7 +263,14 @@ def heat(
 
 @layer
 def histogram(axes: Axes, counts: ArrayLike, edges: ArrayLike, colour: str = AFTER) -> None:
-    """Draw a histogram of k counts (k,) between bin edges (k + 1,)."""
+    """Draw a histogram of k counts (k,) between bin edges (k + 1,).
+
+    Args:
+        axes: axes to draw on.
+        counts: number in each bin.
+        edges: bin edges, rising.
+        colour: colour of the bars.
+    """
     axes.stairs(counts, edges, fill=True, color=colour, alpha=0.9)
     axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
 
@@ -242,6 +280,12 @@ def box(axes: Axes, values: ArrayLike, place: float, colour: str = AFTER) -> Non
     """Draw a horizontal box plot of values (k,) at a y position.
 
     It shows quartiles and median, 5th and 95th percentile, and all points beyond these percentiles.
+
+    Args:
+        axes: axes to draw on.
+        values: the values.
+        place: the y position.
+        colour: colour of the box.
     """
     axes.boxplot(
         [values],
@@ -260,7 +304,14 @@ def box(axes: Axes, values: ArrayLike, place: float, colour: str = AFTER) -> Non
 
 
 def _scale(axes: Axes, mappable: ScalarMappable, unit: str, **options: Any) -> None:
-    """Draw the colour bar of a coloured layer, with its unit as title."""
+    """Draw the colour bar of a coloured layer.
+
+    Args:
+        axes: axes of the layer.
+        mappable: the layer, as matplotlib's drawing function returned it.
+        unit: title of the colour bar; empty: no colour bar.
+        **options: options of matplotlib's ``colorbar``.
+    """
     figure = axes.figure
     scale = figure.colorbar(mappable, ax=axes, pad=0.02, aspect=30, **options)
     scale.ax.set_title(unit, fontsize=7.0, fontweight="normal")
@@ -316,7 +367,14 @@ class Panel:
     def _set_axis(
         self, axes: Axes, axis: XAxis | YAxis, names: Sequence[str] | None, limits: tuple[float, float] | None
     ) -> None:
-        """Set limits, scale and labels of an axis."""
+        """Set limits, scale and labels of an axis.
+
+        Args:
+            axes: the panel's axes.
+            axis: the axis to set.
+            names: labels at 0, 1, … instead of numbers; None: numbers.
+            limits: limits of the axis; None: chosen by the content.
+        """
         letter = axis.axis_name
         if limits:
             axes.set(**{f"{letter}lim": limits})

@@ -13,7 +13,7 @@ from calib.procedure.dynamic_stage.geometry_tables import GEOMETRIES, MIN_SHIFT,
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.metrics import TorqueCurves, UnseenReport
 from calib.procedure.report.charts import Captioned, Chart, Panel, bars, level, line, text
-from calib.procedure.report.dynamics_section import DynamicReport, IdentifiedParameter, percent, proof_of
+from calib.procedure.report.dynamics_section import SIGNIFICANT, DynamicReport, IdentifiedParameter, percent, proof_of
 from calib.procedure.report.style import AFTER, BEFORE, HALF_WIDTH, MARK, PAGE_WIDTH, QUIET, thinned
 from calib.procedure.robot_kinds import Mechanism
 from calib.records import read_rows
@@ -25,8 +25,6 @@ MAX_HALF_PAGE_ROWS = 8
 MAX_ELEMENTS = 15
 # parameters along an axis: more cannot be read on A4
 MAX_LABELS = 40
-# sigmas from which on a change or a value is significant
-SIGNIFICANT = 2.0
 # points of a cloud of friction, and of its curve
 MAX_CLOUD_POINTS = 1400
 CURVE_POINTS = 400
@@ -53,7 +51,11 @@ def captioned(report: DynamicReport, folder: Path | None = None) -> dict[str, Ca
 
 
 def figures(outcome: IdentificationOutcome) -> dict[str, Chart]:
-    """Return the charts of an identification by name: torques of every recording, residuals, and friction."""
+    """Return the charts of an identification by name: torques of every recording, residuals, and friction.
+
+    Args:
+        outcome: the identification.
+    """
     report = UnseenReport.of(outcome.inputs, outcome)
     result = {}
     cases = (*outcome.inputs.unseen, *outcome.inputs.cases)
@@ -66,7 +68,12 @@ def figures(outcome: IdentificationOutcome) -> dict[str, Chart]:
 
 
 def recorded(curves: TorqueCurves, report: UnseenReport) -> Captioned:
-    """Return a chart of one recording's measured and predicted torques, with a caption."""
+    """Return a chart of one recording's measured and predicted torques, with a caption.
+
+    Args:
+        curves: torques of the recording.
+        report: report on the model's errors.
+    """
     scores = {**report.fit, **report.validation}
     raw = scores[curves.name].raw
     if curves.name in report.fit:
@@ -86,6 +93,9 @@ def friction(outcome: IdentificationOutcome) -> dict[str, Chart]:
 
     The chart shows the friction model, and as points the torques of the first training recording minus the rigid-body
     model. If a torque row depends on several joints (such as power), only the friction model is shown.
+
+    Args:
+        outcome: the identification.
     """
     if isinstance(outcome.inputs.robot, Mechanism):
         return {}
@@ -128,7 +138,12 @@ def friction(outcome: IdentificationOutcome) -> dict[str, Chart]:
 
 
 def _friction(column: DriveTerm, velocity: np.ndarray) -> np.ndarray:
-    """Return the values (N,) of a friction term at velocities (N,), with zero position and acceleration."""
+    """Return the values (N,) of a friction term at velocities (N,), with zero position and acceleration.
+
+    Args:
+        column: the friction term.
+        velocity: velocities of its joint [rad/s or m/s].
+    """
     zero = np.zeros(len(velocity))
     return column.values(TermMotion(zero, velocity, zero))
 
@@ -240,6 +255,9 @@ def _geometries(rows: Sequence[TwoGeometries]) -> Chart:
     """Return a chart of the parameters on the nominal and the calibrated geometry, and of their differences in σ.
 
     If there are too many parameters, only those with the largest differences are shown.
+
+    Args:
+        rows: the parameters on both geometries.
     """
     nominal = np.array([row.nominal for row in rows])
     calibrated = np.array([row.calibrated for row in rows])
@@ -291,7 +309,11 @@ def _geometries(rows: Sequence[TwoGeometries]) -> Chart:
 
 
 def _effects(rows: Sequence[GeometricEffect]) -> Chart:
-    """Return a chart of geometric errors, ranked by the largest parameter shift that one σ of the error causes."""
+    """Return a chart of geometric errors, ranked by the largest parameter shift that one σ of the error causes.
+
+    Args:
+        rows: effects of the geometric errors.
+    """
     shifts = np.array([row.shift_sigma or 0.0 for row in rows])
     shifts = np.nan_to_num(shifts, posinf=0.0)
     matters = shifts > MIN_SHIFT
@@ -311,6 +333,9 @@ def _error_charts(unseen: UnseenReport) -> dict[str, Captioned]:
     """Return charts of each torque row's error [%] and residual autocorrelation, by name.
 
     The errors are those of the recording that decides the verdict.
+
+    Args:
+        unseen: report on the model's errors.
     """
     _, proof, motion = proof_of(unseen)
     training = next(iter(unseen.fit.values()))

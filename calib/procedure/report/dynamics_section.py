@@ -24,6 +24,7 @@ from calib.identification.loop import (
 from calib.identification.prediction import Score
 from calib.identification.rows import Case
 from calib.procedure.dynamic_stage import geometry_tables
+from calib.procedure.dynamic_stage.computed_torque import torque_tests
 from calib.procedure.dynamic_stage.folder import IdentificationFolder
 from calib.procedure.dynamic_stage.identify import IdentificationOutcome
 from calib.procedure.dynamic_stage.inputs import IdentificationInputs
@@ -39,8 +40,10 @@ from calib.units import small
 MAX_RSD = 50.0
 # letters of a parameter's expression that are printed
 EXPRESSION_LETTERS = 46
-# geometric errors listed
+# geometric errors listed, and parameters that they change
 MAX_EFFECTS = 8
+# change of a parameter [σ] from which on it counts as changed
+SIGNIFICANT = 2.0
 # share of autocorrelations beyond the bound below which a residual may be called white (0.05 if it is)
 WHITE = 0.10
 ERROR_NOTE = (
@@ -81,7 +84,16 @@ FED_FORWARD = {
 
 
 class IdentifiedParameter(NamedTuple):
-    """A row of ``estimate.csv``; the relative standard deviation `rsd` is in percent; σ is None if not estimated."""
+    """A row of ``estimate.csv``.
+
+    Attributes:
+        name, unit: name and unit of the parameter.
+        expression: text that explains the parameter: the combination of standard parameters that it stands for, or its
+            drive term.
+        value: the estimate.
+        sigma: standard deviation, from torque noise and geometry; None if it was not estimated.
+        rsd: `sigma` in percent of the value; None if it is unknown.
+    """
 
     name: str
     expression: str
@@ -100,12 +112,14 @@ class DynamicReport:
         estimate: the parameters.
         effects: effects of geometric errors on the parameters; empty if the geometry is taken as exact.
         unseen: report on the model's errors on held-out motion, with the verdict.
+        geometries: each parameter identified on the nominal and on the calibrated geometry; empty for one geometry.
     """
 
     metrics: ModelMetrics
     estimate: tuple[IdentifiedParameter, ...]
     effects: tuple[geometry_tables.GeometricEffect, ...]
     unseen: UnseenReport
+    geometries: tuple[geometry_tables.TwoGeometries, ...] = ()
 
 
 def read(folder: Path) -> DynamicReport:
@@ -122,26 +136,38 @@ def read(folder: Path) -> DynamicReport:
         effects: tuple[geometry_tables.GeometricEffect, ...] = ()
         if effects_file.exists():
             effects = read_rows(geometry_tables.GeometricEffect, effects_file)
-        return DynamicReport(metrics, estimate, effects, identification.judged)
+        geometries: tuple[geometry_tables.TwoGeometries, ...] = ()
+        if (folder / geometry_tables.GEOMETRIES).exists():
+            geometries = read_rows(geometry_tables.TwoGeometries, folder / geometry_tables.GEOMETRIES)
+        return DynamicReport(metrics, estimate, effects, identification.judged, geometries)
     except (OSError, ValueError) as error:
         raise UsageError(f"{folder}: {error}; identify again: calib redo … identify") from error
 
 
 def read_lines(inputs: IdentificationInputs) -> list[str]:
-    """Return lines of text that list the robot and the recordings that were read."""
+    """Return lines of text that list the robot and the recordings that were read.
+
+    Args:
+        inputs: robot and recordings of the identification.
+    """
     chain = inputs.chain
     lines = [str(inputs.robot)]
     if isinstance(chain, Chain):
         geometry = "calibrated" if inputs.robot.moved else "nominal geometry"
         lines = [f"robot {chain.name}: {chain.n} joints, {chain.base} to {chain.tip}, {geometry}"]
-    lines += [_recording_line(case, "to learn from") for case in inputs.cases]
+    lines += [_recording_line(case, "for training") for case in inputs.cases]
     lines += [_recording_line(case, "unseen") for case in inputs.unseen]
     lines += [f"  {page.single_colons(note)}" for note in inputs.notes]
     return lines
 
 
 def _recording_line(case: Case, role: str) -> str:
-    """Return a line of text on a recording: name, duration, rate, kind of torque, payload, and use."""
+    """Return a line of text on a recording: name, duration, rate, kind of torque, payload, and use.
+
+    Args:
+        case: the recording.
+        role: its use, such as ``unseen``.
+    """
     motion = case.motion
     # a recording cut as log.npz@10: ends with a colon
     name = case.name.rstrip(":")
@@ -169,7 +195,11 @@ def of_outcome(outcome: IdentificationOutcome, folder: Path | None = None) -> Dy
 
 
 def outcome_section(outcome: IdentificationOutcome) -> page.Section:
-    """Return the console output on an identification: the report section without figures and parameters."""
+    """Return the console output on an identification: the report section without figures and parameters.
+
+    Args:
+        outcome: the identification.
+    """
     return report_section(of_outcome(outcome), {})
 
 
@@ -179,6 +209,7 @@ def report_section(
     exported: Sequence[str] = (),
     tolerance: float = 0.0,
     delivered: float | None = None,
+    tolerances: Sequence[float] = (),
 ) -> page.Section:
     """Return the report section on the dynamics: errors on held-out motion, torques, excitation, and parameters.
 
@@ -188,9 +219,12 @@ def report_section(
         exported: remarks on the export.
         tolerance: largest acceptable torque error on held-out motion [%]; 0: no tolerance.
         delivered: torque error of the exported robot on held-out motion [%]; None: unknown.
+        tolerances: largest acceptable rms torque error of each joint, or one for all [N m or N]; empty: none.
     """
     metrics, unseen = report.metrics, report.unseen
     blocks: list[page.Block] = [_error_table(unseen), _reference_table(unseen), _interval_table(unseen)]
+    if tolerances:
+        blocks.insert(0, _test_table(unseen, tolerances))
 
     torque_figures = [name for name in figures if name.startswith("torque_")]
     blocks.append(page.pictures("", figures, ("errors", "residuals")))
@@ -202,6 +236,7 @@ def report_section(
     blocks.append(page.Text("The model", _model_sentences(metrics)))
     blocks.append(page.Text("What the motion identifies", _identifiability(report)))
     blocks += _geometry_blocks(metrics, report.effects)
+    blocks += _comparison_blocks(report.geometries)
     blocks.append(page.pictures("", figures, ("geometries", "geometry_effects")))
     blocks.append(page.pictures("Dynamic parameters", figures, ("significance",)))
     blocks.append(_parameter_table(report.estimate))
@@ -216,9 +251,23 @@ def report_section(
     return page.Section("Dynamics", blocks, unseen.verdict, unseen.reason, key_figures)
 
 
+def _test_table(unseen: UnseenReport, tolerances: Sequence[float]) -> page.ReportTable:
+    """Return the table of the computed-torque test: rms error of each torque row beside its tolerance."""
+    rows = []
+    for test in torque_tests(tolerances, unseen.proofs, unseen.rows):
+        met = "yes" if test.passed else "no"
+        rows.append([test.row, f"{test.rms:.3g}", f"{test.tolerance:g}", met, test.recording])
+    header = ("torque", "rms error [N m or N]", "tolerance", "within", "recording")
+    return page.ReportTable("Computed-torque test on unseen motion", header, rows, numbers=[1, 2])
+
+
 def _parameter_table(estimate: Sequence[IdentifiedParameter]) -> page.ReportTable:
-    """Return the table of identified parameters with value, σ and relative standard deviation."""
-    header = ("parameter", "unit", "value", "σ", "RSD", "what it holds")
+    """Return the table of identified parameters with value, σ and relative standard deviation.
+
+    Args:
+        estimate: the parameters.
+    """
+    header = ("parameter", "unit", "value", "σ", "RSD", "contents")
     rows = []
     for parameter in estimate:
         sigma = "" if parameter.sigma is None else f"{parameter.sigma:.2g}"
@@ -233,6 +282,9 @@ def warnings_of(report: DynamicReport) -> list[str]:
     """Return the warnings of identification and validation without duplicates.
 
     The warning that there is no held-out motion is omitted if the validation has such motion.
+
+    Args:
+        report: stored results of the identification.
     """
     refuted: list[str] = []
     if report.unseen.proofs:
@@ -247,6 +299,9 @@ def proof_of(unseen: UnseenReport) -> tuple[str, Score, str]:
 
     It is the held-out recording with the largest error; without held-out motion, the training recording with the
     largest error.
+
+    Args:
+        unseen: report on the model's errors.
     """
     scores, motion = unseen.fit, "the training motion"
     if unseen.proofs:
@@ -304,7 +359,7 @@ def _key_figures(unseen: UnseenReport, tolerance: float, delivered: float | None
 
 
 def percent(value: float) -> str:
-    """Return a percentage with three significant digits as text; a dash if it is not finite."""
+    """Return a percentage `value` [%] with three significant digits as text; a dash if it is not finite."""
     return _number(value, " %")
 
 
@@ -314,7 +369,11 @@ def _rsd(percent: float) -> str:
 
 
 def _error_table(unseen: UnseenReport) -> page.ReportTable:
-    """Return the table of torque errors for each recording and torque row."""
+    """Return the table of torque errors for each recording and torque row.
+
+    Args:
+        unseen: report on the model's errors.
+    """
     groups = {}
     for name, score in unseen.fit.items():
         groups[f"{name} (fitted)"] = _error_rows(score, unseen)
@@ -325,7 +384,12 @@ def _error_table(unseen: UnseenReport) -> page.ReportTable:
 
 
 def _error_rows(score: Score, unseen: UnseenReport) -> Iterator[Sequence[str]]:
-    """Yield the rows of the error table for one recording: first all torques together, then each torque row."""
+    """Yield the rows of the error table for one recording: first all torques together, then each torque row.
+
+    Args:
+        score: score of the model on the recording.
+        unseen: report on the model's errors, with the names of the torque rows.
+    """
     parts = score.raw, score.filtered, score.moving, score.standing
     totals = [percent(part.total) for part in parts]
     yield "all", "", "", *totals, "", ""
@@ -337,7 +401,13 @@ def _error_rows(score: Score, unseen: UnseenReport) -> Iterator[Sequence[str]]:
 
 
 def rms_words(score: Score, unseen: UnseenReport, row: int) -> tuple[str, str]:
-    """Return as texts a torque row's rms error in its unit, and in percent of its limit; "–" if unknown."""
+    """Return as texts a torque row's rms error in its unit, and in percent of its limit; "–" if unknown.
+
+    Args:
+        score: score of the model on a recording.
+        unseen: report with units and limits of the torque rows.
+        row: index of the torque row, from 0.
+    """
     rms = score.raw.rms[row]
     if not np.isfinite(rms):
         return "–", "–"
@@ -352,18 +422,26 @@ def _of_all(row: Sequence[str]) -> bool:
 
 
 def _reference_table(unseen: UnseenReport) -> page.ReportTable:
-    """Return the table of errors on held-out motion by the plain references and by the model; may be empty."""
+    """Return the table of errors on held-out motion by the plain references and by the model; may be empty.
+
+    Args:
+        unseen: report on the model's errors.
+    """
     header = ("recording", "nominal masses, no friction", "plain least squares", "this model")
     rows = []
     for recording, references in unseen.references.items():
         errors = references.nominal, references.plain, references.delivered
         rows.append([recording, *map(percent, errors)])
-    title = "Beside plain references: torque unexplained on held-out motion"
+    title = "Comparison with plain references: torque unexplained on held-out motion"
     return page.ReportTable(title, header, rows, REFERENCE_NOTE, numbers=[1, 2, 3])
 
 
 def _interval_table(unseen: UnseenReport) -> page.ReportTable:
-    """Return the table of the coverage of predicted 95 % intervals on held-out recordings; may be empty."""
+    """Return the table of the coverage of predicted 95 % intervals on held-out recordings; may be empty.
+
+    Args:
+        unseen: report on the model's errors.
+    """
     groups = {}
     for name, score in unseen.validation.items():
         coverage = score.interval95
@@ -385,7 +463,11 @@ def _interval_table(unseen: UnseenReport) -> page.ReportTable:
 
 
 def _friction_table(metrics: ModelMetrics) -> page.ReportTable:
-    """Return the table of the tried friction models with their errors on held-out time, in total and by torque row."""
+    """Return the table of the tried friction models with their errors on held-out time, in total and by torque row.
+
+    Args:
+        metrics: metrics of the identification.
+    """
     count = max(len(step.joints_percent) for step in metrics.ladder)
     joints = [str(j + 1) for j in range(count)]
     header = ["friction", "p", "total", *joints, "kept at joints"]
@@ -409,7 +491,11 @@ def _rounded(share: float, digits: int) -> str:
 
 
 def _model_sentences(metrics: ModelMetrics) -> list[str]:
-    """Return sentences on the model: ripple, couplings, method, number of parameters, and eliminated parameters."""
+    """Return sentences on the model: ripple, couplings, method, number of parameters, and eliminated parameters.
+
+    Args:
+        metrics: metrics of the identification.
+    """
     lines = [_ripple_sentence(ripple) for ripple in metrics.ripple]
     lines += _coupling_sentences(metrics)
     lines.append(f"method {metrics.method}: assumes that {metrics.method_assumes}")
@@ -454,6 +540,9 @@ def _coupling_sentences(metrics: ModelMetrics) -> list[str]:
     """Return sentences on how much each coupling term between two joints lowers the errors of these joints.
 
     The physical cause of a coupling is not stated, since nobody measured it in the drives.
+
+    Args:
+        metrics: metrics of the identification.
     """
     lines: list[str] = []
     if not metrics.ladder:
@@ -492,6 +581,28 @@ def _geometry_blocks(metrics: ModelMetrics, effects: Sequence[geometry_tables.Ge
     if geometry.changed and relevant:
         blocks.append(_effect_table(relevant[:MAX_EFFECTS]))
     return blocks
+
+
+def _comparison_blocks(rows: Sequence[geometry_tables.TwoGeometries]) -> list[page.Block]:
+    """Return the table of the parameters that the calibrated geometry changes most, in σ; empty for one geometry."""
+    if not rows:
+        return []
+    with_sigma = [row for row in rows if row.sigma_calibrated > 0.0]
+    changes = np.array([(row.calibrated - row.nominal) / row.sigma_calibrated for row in with_sigma])
+    table = []
+    for k in np.argsort(-np.abs(changes), kind="stable")[:MAX_EFFECTS]:
+        row = with_sigma[k]
+        nominal = f"{row.nominal:.4g} ± {row.sigma_nominal:.2g}"
+        calibrated = f"{row.calibrated:.4g} ± {row.sigma_calibrated:.2g}"
+        table.append([row.name, row.unit, nominal, calibrated, f"{changes[k]:.2g} σ", row.essential])
+    count = int(np.sum(np.abs(changes) > SIGNIFICANT))
+    note = (
+        f"{count} of {len(rows)} parameters change by more than {SIGNIFICANT:g} σ between the nominal and the "
+        "calibrated geometry, identified from the same torques; all: geometries.csv."
+    )
+    header = ("parameter", "unit", "nominal geometry", "calibrated geometry", "change", "essential")
+    title = "What the calibrated geometry changed in the dynamics"
+    return [page.ReportTable(title, header, table, note, numbers=[2, 3, 4])]
 
 
 def _effect_table(effects: Sequence[geometry_tables.GeometricEffect]) -> page.ReportTable:
@@ -603,7 +714,11 @@ def tracking_blocks(replays: Mapping[str, Replay], failure: str = "") -> list[pa
 
 
 def _identifiability(report: DynamicReport) -> list[str]:
-    """Return sentences on parameters that are not distinguishable from zero, and on whether the residuals are white."""
+    """Return sentences on parameters that are not distinguishable from zero, and on whether the residuals are white.
+
+    Args:
+        report: stored results of the identification.
+    """
     lines = []
     weak = [row.name for row in report.estimate if row.rsd is not None and row.rsd > MAX_RSD]
     if weak:

@@ -100,8 +100,7 @@ class RowErrors:
     worst: RowErrors | None = None
 
     def judged(self, deliverable: str) -> Mapping[str, tuple[float, ...]]:
-        """Return the errors of the deliverable that is judged: nature (position, orientation, distance) -> errors [m,
-        rad].
+        """Return the errors of the deliverable that is judged, by nature (position, orientation, distance) [m, rad].
 
         Args:
             deliverable: ``urdf`` or ``corrections``.
@@ -141,7 +140,7 @@ class Report:
         noise: nature (position, orientation) -> rms error that the instrument's stated σ alone causes [m, rad]; None:
             no σ was stated.
         images: density of detected corners over each camera's images; empty: no images.
-        files: files that were read, see `file_row`.
+        files: files that were read: name, role, size in bytes, SHA-256.
         source: path of the robot's description.
     """
 
@@ -165,7 +164,12 @@ class Report:
     source: str = ""
 
     def with_unseen(self, validation: ValidationMetrics, sets: Sequence[RowErrors]) -> Report:
-        """Return the report with further held-out rows (`rows_of`), and with updated verdict, reason and warnings."""
+        """Return the report with further held-out rows (`rows_of`), and with updated verdict, reason and warnings.
+
+        Args:
+            validation: new results on validation rows, with the verdict.
+            sets: errors on the further rows; a set with the name of an earlier one replaces it.
+        """
         metrics = replace(self.metrics, **vars(validation))
         replaced = {rows.name for rows in sets}
         remaining = [rows for rows in self.sets if rows.name not in replaced]
@@ -215,7 +219,13 @@ def collect(outcome: Outcome) -> Report:
 
 
 def file_row(name: str, role: str, path: Path) -> FileRow:
-    """Return the entry of a file in the certificate: name, role, size in bytes, SHA-256."""
+    """Return the entry of a file in the certificate: name, role, size in bytes, SHA-256.
+
+    Args:
+        name: printed name.
+        role: use of the file, such as "nominal robot".
+        path: the file.
+    """
     return name, role, str(path.stat().st_size), files.fingerprint(path)
 
 
@@ -232,7 +242,11 @@ def unseen_role(role: str, seen: bool, judged: str) -> str:
 
 
 def _file_rows(inputs: Inputs) -> tuple[FileRow, ...]:
-    """Return the certificate's entries of the robot's description and of the files for fit and validation."""
+    """Return the certificate's entries of the robot's description and of the files for fit and validation.
+
+    Args:
+        inputs: robot and measurements.
+    """
     roles = {inputs.source: "nominal robot"}
     for block in inputs.fit:
         if block.file:
@@ -244,9 +258,15 @@ def _file_rows(inputs: Inputs) -> tuple[FileRow, ...]:
 
 
 def rows_of(name: str, comparison: Comparison, unseen: bool) -> RowErrors:
-    """Return the errors on one set of rows; with joint values and target positions if each row has its own error.
+    """Return the errors on one set of rows.
 
-    From more than `MAX_ROWS` rows, a random sample and the worst row are taken.
+    Joint values and target positions are included if there is one error per row; distances between two rows, for
+    example, have no row of their own. From more than `MAX_ROWS` rows, a random sample and the worst row are taken.
+
+    Args:
+        name: name of the set.
+        comparison: errors of the arms on the rows.
+        unseen: whether the rows were held out from the fit.
     """
     sizes = comparison.errors[1].main
     if len(sizes) != sum(map(len, comparison.blocks)):
@@ -262,7 +282,14 @@ def rows_of(name: str, comparison: Comparison, unseen: bool) -> RowErrors:
 
 
 def _errors_by_nature(name: str, comparison: Comparison, unseen: bool, selection: slice | np.ndarray) -> RowErrors:
-    """Return the selected errors of three arms: nominal, calibrated, and calibrated without joint corrections."""
+    """Return the selected errors of three arms: nominal, calibrated, and calibrated without joint corrections.
+
+    Args:
+        name: name of the set.
+        comparison: errors of the arms on the rows.
+        unseen: whether the rows were held out from the fit.
+        selection: indices of the selected errors.
+    """
     errors_by_arm = []
     for errors in (*comparison.errors, comparison.alone):
         by_nature = {}
@@ -276,7 +303,14 @@ def _errors_by_nature(name: str, comparison: Comparison, unseen: bool, selection
 
 
 def _errors_by_row(name: str, comparison: Comparison, unseen: bool, selection: slice | np.ndarray) -> RowErrors:
-    """Return the errors of the selected rows with joint values, target positions, expected errors and row numbers."""
+    """Return the errors of the selected rows with joint values, target positions, expected errors and row numbers.
+
+    Args:
+        name: name of the set.
+        comparison: errors of the arms on the rows.
+        unseen: whether the rows were held out from the fit.
+        selection: indices of the selected rows.
+    """
     q = np.concatenate([block.q for block in comparison.blocks])
     numbers = np.concatenate([block.rows for block in comparison.blocks])
     points = _points(comparison)
@@ -293,7 +327,11 @@ def _errors_by_row(name: str, comparison: Comparison, unseen: bool, selection: s
 
 
 def _points(comparison: Comparison) -> np.ndarray:
-    """Return the positions (rows, 3) [m] of the targets in the arm's base frame, as predicted by the calibrated arm."""
+    """Return the positions (rows, 3) [m] of the targets in the arm's base frame, as predicted by the calibrated arm.
+
+    Args:
+        comparison: the rows, and the arms that predict them.
+    """
     cell = comparison.cells[1]
     points = []
     for block in prepare(cell, comparison.blocks):
@@ -342,7 +380,11 @@ def _stated_rms(blocks: Sequence[PoseMeasurements], field_name: str) -> float | 
 
 
 def _plain(values: np.ndarray) -> tuple[Any, ...]:
-    """Return numbers rounded to seven significant digits, as a tuple or nested tuples."""
+    """Return an array of numbers, rounded to seven significant digits, as a tuple or nested tuples.
+
+    Args:
+        values: the array.
+    """
     rounded = [float(f"{value:.7g}") for value in np.ravel(values)]
     nested = np.array(rounded).reshape(np.shape(values)).tolist()
     if np.ndim(values) == 1:
@@ -356,7 +398,7 @@ def write(report: Report, path: Path) -> None:
 
 
 def read(path: Path) -> Report:
-    """Return a fit's report, read from a JSON file.
+    """Return a fit's report, read from the JSON file `path`.
 
     Raises:
         UsageError: if the file is missing or was written by another version.

@@ -87,7 +87,8 @@ def residuals_by_joint(
         before, after: (m,) error sizes of the nominal and of the calibrated arm [m] or [rad].
         joint_names: (n,) names of the joints.
         prismatic: (n,) whether each joint is prismatic.
-        nature, arm: as in `error_histogram`.
+        nature: ``position``, ``orientation`` or ``distance``.
+        arm: printed name of the arm with the errors `after`.
     """
     factor, unit = ERRORS[nature]
     sizes = factor * np.concatenate([before, after])
@@ -157,10 +158,14 @@ def error_map(
 def _map_panel(
     points: np.ndarray, sizes_mm: np.ndarray, limits_mm: tuple[float, float], axis: int, title: str
 ) -> Panel:
-    """Return a map of sizes [mm] at points (m, 3) [m] over x and another axis.
+    """Return a map of sizes at points over x and another axis.
 
     Args:
+        points: (m, 3) positions [m].
+        sizes_mm: (m,) sizes at the points, shown by colours [mm].
+        limits_mm: sizes at the ends of the colour scale [mm].
         axis: vertical axis of the map: 1 for y, 2 for z; only the map over z has a colour bar.
+        title: title of the map.
     """
     layers = [
         dots(points[:, 0], points[:, axis], sizes_mm, *limits_mm, "[mm]" if axis == 2 else ""),
@@ -171,7 +176,12 @@ def _map_panel(
 
 
 def predicted_map(points: np.ndarray, sigma: np.ndarray) -> Chart:
-    """Return a map of the predicted σ (m,) [m] of the tool's position at workspace points (m, 3) [m]."""
+    """Return a map of the predicted σ (m,) [m] of the tool's position at workspace points (m, 3) [m].
+
+    Args:
+        points: positions of the tool.
+        sigma: predicted σ.
+    """
     return error_map(points, sigma, words="predicted σ up to {}", least=float(np.min(sigma)))
 
 
@@ -226,8 +236,9 @@ def parameter_changes(rows: Sequence[FittedParameter], most: int = 48, of: str =
 
 
 def singular_values(values: np.ndarray, rank: int) -> Chart:
-    """Return a chart of the singular values of the scaled observation matrix, and of the gap below the identifiable
-    ones.
+    """Return a chart of the singular values of the scaled observation matrix.
+
+    It marks the gap below the singular values of the identifiable parameter combinations.
 
     Args:
         values: (p,) singular values in descending order.

@@ -47,7 +47,11 @@ ALONE_NOTE = (
 
 
 def read_lines(inputs: Inputs) -> list[str]:
-    """Return lines of text that list the robot and the measurements that were read."""
+    """Return lines of text that list the robot and the measurements that were read.
+
+    Args:
+        inputs: robot and measurements of the fit.
+    """
     chain = inputs.chain
     lines = [f"robot {chain.name}: {chain.n} joints, {chain.base} to {chain.tip}"]
     for block in inputs.fit:
@@ -65,7 +69,11 @@ def read_lines(inputs: Inputs) -> list[str]:
 
 
 def outcome_section(metrics: FitMetrics) -> page.Section:
-    """Return the console output on a fit: tried models, errors, repeated poses, findings, and verdict."""
+    """Return the console output on a fit: tried models, errors, repeated poses, findings, and verdict.
+
+    Args:
+        metrics: metrics of the fit.
+    """
     sets = _sets(metrics)
     blocks: list[page.Block] = [_ladder_table(metrics), error_table(sets, metrics.deliverable)]
     lines = [f"model {metrics.model}, {parameter_words(metrics)}"]
@@ -112,6 +120,9 @@ def _key_figures(report: Report) -> list[page.KeyFigure]:
 
     They are those of the worst held-out rows. Without held-out rows, they are the cross-validated errors if the verdict
     is based on these, otherwise the errors on the fitted rows.
+
+    Args:
+        report: stored results of the fit.
     """
     metrics = report.metrics
     if not metrics.proofs:
@@ -162,7 +173,13 @@ def _key_figures(report: Report) -> list[page.KeyFigure]:
 
 
 def _rms_spread(rows: RowErrors | None, arm: str, nature: str) -> str:
-    """Return the standard error of an arm's rms error as text; empty if it is unknown."""
+    """Return the standard error of an arm's rms error as text; empty if it is unknown.
+
+    Args:
+        rows: errors on the rows; None: not stored, so that the result is empty.
+        arm: key of an arm: ``calibrated`` or ``urdf_alone``.
+        nature: ``position``, ``orientation`` or ``distance``.
+    """
     if rows is None:
         return ""
     errors = rows.urdf_alone if arm == "urdf_alone" else rows.calibrated
@@ -177,6 +194,9 @@ def deciding(report: Report) -> tuple[ComparedRows, RowErrors | None]:
     """Return the rows on which the verdict is based, and the error of each row (None: not stored).
 
     They are the held-out rows with the largest error; without held-out rows, the fitted rows.
+
+    Args:
+        report: stored results of the fit.
     """
     metrics = report.metrics
     name = next(iter(metrics.proofs), "fit")
@@ -194,6 +214,9 @@ def _cross_validated_figure(metrics: FitMetrics) -> page.KeyFigure | None:
     """Return the cross-validated errors of the nominal and the calibrated arm.
 
     None if the verdict is based on other errors (`validation.judge`).
+
+    Args:
+        metrics: metrics of the fit.
     """
     findings, nominal = metrics.findings, metrics.fit.nominal.main
     if findings is None or findings.cross_validated is None or nominal is None or len(metrics.ladder) < 2:
@@ -231,7 +254,11 @@ def _arm_errors(rows: ComparedRows, arm: str, key: str) -> ErrorStatistics | Non
 
 
 def _sets(metrics: FitMetrics) -> list[tuple[str, ComparedRows]]:
-    """Return the fitted and the validation rows, each with a label for tables."""
+    """Return the fitted and the validation rows, each with a label for tables.
+
+    Args:
+        metrics: metrics of the fit.
+    """
     sets = [(f"fitted: {metrics.fit.poses} poses", metrics.fit)]
     for name, rows in metrics.validation.items():
         role = "unseen" if rows.unseen else "NOT unseen"
@@ -240,7 +267,11 @@ def _sets(metrics: FitMetrics) -> list[tuple[str, ComparedRows]]:
 
 
 def meanings(rows: ComparedRows) -> list[str]:
-    """Return sentences that explain how position errors are defined if positions were not measured directly."""
+    """Return sentences that explain how position errors are defined if positions were not measured directly.
+
+    Args:
+        rows: errors on a set of rows.
+    """
     return [sentence for name, sentence in MEANS.items() if name in rows.position_means]
 
 
@@ -290,7 +321,11 @@ def _error_rows(rows: ComparedRows) -> Iterator[tuple[str, ...]]:
 
 
 def _ladder_table(metrics: FitMetrics) -> page.ReportTable:
-    """Return the table of the tried models with their errors on held-out rows."""
+    """Return the table of the tried models with their errors on held-out rows.
+
+    Args:
+        metrics: metrics of the fit.
+    """
     header = ("model", "parameters", "cross-validated rms [mm]", "remark")
     rows = []
     strong = set()
@@ -307,7 +342,11 @@ def _ladder_table(metrics: FitMetrics) -> page.ReportTable:
 
 
 def _outlier_table(metrics: FitMetrics) -> page.ReportTable:
-    """Return the table of outliers, largest first."""
+    """Return the table of outliers, largest first.
+
+    Args:
+        metrics: metrics of the fit.
+    """
     columns = (
         page.RecordColumn("file", _file_name, number=False),
         page.RecordColumn("row", "{0.row}"),
@@ -336,7 +375,11 @@ def parameter_words(metrics: FitMetrics) -> str:
 
 
 def error_words(metrics: FitMetrics) -> str:
-    """Return a text on the rms errors on the fitted poses."""
+    """Return a text on the rms errors on the fitted poses.
+
+    Args:
+        metrics: metrics of the fit.
+    """
     return f"{_rms_words(metrics.fit, metrics.deliverable)} on {metrics.fit.poses} fitted poses"
 
 
@@ -345,6 +388,10 @@ def _rms_words(rows: ComparedRows, deliverable: str) -> str:
 
     If a robot with and one without joint corrections is delivered, the errors of the one that is not judged are in
     brackets.
+
+    Args:
+        rows: errors on a set of rows.
+        deliverable: ``urdf`` or ``corrections``.
     """
     arms = {"nominal": rows.nominal, ARM["urdf"]: rows.calibrated}
     alternative = {}
@@ -361,7 +408,11 @@ def _rms_words(rows: ComparedRows, deliverable: str) -> str:
 
 
 def _parameter_table(report: Report) -> page.ReportTable:
-    """Return the table of fitted parameters; joint corrections are omitted if there are too many parameters."""
+    """Return the table of fitted parameters; joint corrections are omitted if there are too many parameters.
+
+    Args:
+        report: stored results of the fit.
+    """
     parameters = report.parameters
     if len(report.parameters) > MAX_ROWS:
         parameters = tuple(row for row in report.parameters if row.group != "deflection")
@@ -386,7 +437,11 @@ def _parameter_table(report: Report) -> page.ReportTable:
 
 
 def outlier_sentences(metrics: FitMetrics) -> list[str]:
-    """Return a sentence on the number of outliers and on the largest ones; an empty list without outliers."""
+    """Return a sentence on the number of outliers and on the largest ones; an empty list without outliers.
+
+    Args:
+        metrics: metrics of the fit.
+    """
     if not metrics.outliers:
         return []
     rows = {(outlier.file, outlier.row) for outlier in metrics.outliers}
@@ -400,7 +455,11 @@ def outlier_sentences(metrics: FitMetrics) -> list[str]:
 
 
 def _identifiability(report: Report) -> list[str]:
-    """Return sentences on parameters that are not identifiable or strongly correlated."""
+    """Return sentences on parameters that are not identifiable or strongly correlated.
+
+    Args:
+        report: stored results of the fit.
+    """
     lines = []
     candidates = len(report.singular_values)
     undetermined, fitted = report.metrics.not_identifiable, report.metrics.fit.parameters
@@ -422,13 +481,21 @@ def _identifiability(report: Report) -> list[str]:
 
 
 def _repeated_sentences(metrics: FitMetrics) -> list[str]:
-    """Return a sentence on pose accuracy and repeatability for each set of rows with repeated poses."""
+    """Return a sentence on pose accuracy and repeatability for each set of rows with repeated poses.
+
+    Args:
+        metrics: metrics of the fit.
+    """
     sets = {"fitted": metrics.fit, **metrics.validation}
     return [f"{name}: {iso9283_words(rows)}" for name, rows in sets.items() if rows.iso9283]
 
 
 def iso9283_words(rows: ComparedRows) -> str:
-    """Return a sentence on the accuracy and repeatability of repeated poses; empty if no pose was repeated."""
+    """Return a sentence on the accuracy and repeatability of repeated poses; empty if no pose was repeated.
+
+    Args:
+        rows: errors on a set of rows.
+    """
     if rows.iso9283 is None:
         return ""
     return iso9283_sentence(rows.iso9283, ARM["corrections"] if rows.urdf_alone else ARM["urdf"])

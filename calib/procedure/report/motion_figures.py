@@ -33,8 +33,7 @@ TITLES = ("position", "velocity", "acceleration", "torque")
 
 
 def motion_sheet(times: np.ndarray, series: Sequence[Limited], joints: Sequence[Joint]) -> Chart:
-    """Return a chart of the joint motion over time, with one row per joint and one column per quantity; limits are
-    dashed.
+    """Return a chart of the joint motion over time, with a row per joint and a column per quantity.
 
     Args:
         times: (N,) times [s].
@@ -64,7 +63,11 @@ def motion_sheet(times: np.ndarray, series: Sequence[Limited], joints: Sequence[
 
 
 def _motion_figure(designed: Designed) -> Chart:
-    """Return a chart of each joint's position, velocity, acceleration and torque over one period; limits are dashed."""
+    """Return a chart of each joint's position, velocity, acceleration and torque over one period; limits are dashed.
+
+    Args:
+        designed: the motion.
+    """
     motion, model, limits = _dense_motion(designed), designed.inputs.model, designed.inputs.limits
     infinite = np.full(designed.inputs.chain.n, np.inf)
     # the order of the derivative that is limited: 0 position, 1 velocity, 2 acceleration
@@ -80,7 +83,7 @@ def _motion_figure(designed: Designed) -> Chart:
 
 
 def _path_figure(designed: Designed) -> Chart:
-    """Return a chart of the tool's path, seen from above and from the side."""
+    """Return a chart of the tool's path in a designed motion, seen from above and from the side."""
     position = sweep(designed.inputs.chain, _dense_motion(designed).q).position
     panels = []
     for axis, title in ((1, "the tool's path from above"), (2, "from the side")):
@@ -96,7 +99,13 @@ def _path_figure(designed: Designed) -> Chart:
 
 
 def _history_figure(designed: Designed) -> Chart:
-    """Return a chart of the objective over the search, for the start point that led to the best motion."""
+    """Return a chart of the objective over the search for a motion.
+
+    It shows the search from the start point that led to the best motion.
+
+    Args:
+        designed: the motion.
+    """
     history = np.asarray(designed.found.history, dtype=float)
     title = f"{history[0]:.4g} at first, {history[-1]:.4g} at last" if len(history) else ""
     curve = line(np.arange(len(history)), history)
@@ -104,7 +113,11 @@ def _history_figure(designed: Designed) -> Chart:
 
 
 def front_figure(front: Front) -> Chart:
-    """Return a chart of the trade-off between condition number and mean torque; open points are dominated by others."""
+    """Return a chart of the trade-off between condition number and mean torque; open points are dominated by others.
+
+    Args:
+        front: the trade-offs, with the condition number as the first and the torque slack as the second objective.
+    """
     condition, torque = front.values[:, 0], 1.0 - front.values[:, 1]
     order = np.argsort(torque)
     efficient, dominated = order[front.best[order]], order[~front.best[order]]
@@ -157,7 +170,10 @@ def write_plan(planned: Planned, folder: Path) -> None:
 
 
 def _plan_figure(planned: Planned) -> Chart:
-    """Return a chart of each joint's position, velocity, acceleration and torque; limits are dashed."""
+    """Return a chart of each joint's position, velocity, acceleration and torque in a planned motion.
+
+    Limits are dashed.
+    """
     track, limits = planned.track, planned.limits
     series: list[Limited] = [
         (track.q, planned.lower, planned.upper),
@@ -170,7 +186,7 @@ def _plan_figure(planned: Planned) -> Chart:
 
 
 def _profile_figure(planned: Planned) -> Chart:
-    """Return a chart of the speed along the path, and of the used share of each limit."""
+    """Return a chart of the speed along the path of a planned motion, and of the used share of each limit."""
     speeds, shares = [], []
     start = 0.0
     for timing in planned.timings:

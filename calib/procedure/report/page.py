@@ -141,7 +141,11 @@ def shortened(text: str, max_letters: int) -> str:
 class Text:
     """A list of sentences.
 
-    On the console, each sentence is printed after `label`, or after ``warning`` if it is a warning.
+    Attributes:
+        title: title above the sentences; empty: none.
+        lines: the sentences; a `Note` may be a warning.
+        label: word before each sentence on the console; a warning has ``warning`` instead.
+        kind: name of the kind of block, for the templates.
     """
 
     title: str
@@ -183,7 +187,13 @@ class Pictures:
 
 
 def pictures(title: str, figures: Mapping[str, Picture], names: Iterable[str]) -> Pictures:
-    """Return the figures with the given names, to be shown side by side; absent figures are left out."""
+    """Return the figures with the given names, to be shown side by side; absent figures are left out.
+
+    Args:
+        title: title above the figures.
+        figures: name -> figure.
+        names: names of the figures to show.
+    """
     return Pictures(title, [figures[name] for name in names if name in figures])
 
 
@@ -223,7 +233,12 @@ def met(value: float, tolerance: float) -> str:
 class Section:
     """A part of a report.
 
-    A section on a judged result has a verdict (pass, marginal, fail), a reason and key figures.
+    Attributes:
+        title: title of the section.
+        blocks: tables, texts and pictures.
+        verdict, reason: level of the verdict (pass, marginal, fail) and its reason; empty for sections that are not on
+            a judged result.
+        figures: numbers on which the verdict is based.
     """
 
     title: str
@@ -234,7 +249,7 @@ class Section:
 
 
 def relative_sigma(percent: float | None) -> str:
-    """Return a relative standard deviation [%] as text; empty if it is None or above `MAX_PRINTED_RSD`."""
+    """Return a relative standard deviation `percent` [%] as text; empty if it is None or above `MAX_PRINTED_RSD`."""
     if percent is None or percent > MAX_PRINTED_RSD:
         return ""
     if percent >= 10:

@@ -113,7 +113,7 @@ def log_axis(axis: XAxis | YAxis, low: float, high: float, most: int = 7) -> Non
 
 
 def tick_text(value: float, _: object) -> str:
-    """Return the label of a tick; matplotlib calls this function as a formatter."""
+    """Return the label of a tick at `value`; matplotlib calls this function as a formatter."""
     return number(value)
 
 
@@ -121,7 +121,7 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def number(value: float) -> str:
-    """Return a number as the label of a tick: plain between about 0.001 and 100 000, otherwise with a power of ten."""
+    """Return `value` as the label of a tick: plain from about 0.001 to 100 000, otherwise with a power of ten."""
     if value == 0.0 or 0.99e-3 < abs(value) < 0.99e5:
         return f"{value:g}"
     digits, power = f"{value:.0e}".split("e")
@@ -158,8 +158,9 @@ def legend(figure: Figure, axes: Axes | None, title: str) -> None:
 
 
 def thinned(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a curve with fewer points: the minimum and maximum of each of `STRETCHES` intervals, so that all peaks
-    remain.
+    """Return a curve with fewer points, of which all peaks remain.
+
+    The points are the minimum and maximum of each of `STRETCHES` intervals.
 
     Args:
         t: (N,) times [s].
@@ -177,7 +178,12 @@ def thinned(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def png(figure: Figure, dpi: float = DPI) -> bytes:
-    """Return a figure as the content of a PNG file."""
+    """Return a figure as the content of a PNG file.
+
+    Args:
+        figure: the figure.
+        dpi: resolution [dots per inch].
+    """
     with styled():
         figure.set_dpi(dpi)
         canvas = FigureCanvasAgg(figure)
@@ -204,5 +210,11 @@ def svg(figure: Figure) -> bytes:
 
 
 def save(figure: Figure, path: str | Path, dpi: float = DPI) -> Path:
-    """Write a figure as PNG; the file is written completely or not at all."""
+    """Write a figure as PNG; the file is written completely or not at all.
+
+    Args:
+        figure: the figure.
+        path: the PNG file.
+        dpi: resolution [dots per inch].
+    """
     return files.write(path, png(figure, dpi))

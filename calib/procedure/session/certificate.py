@@ -103,7 +103,10 @@ def _geometry(session: Session, report: fit_report.Report) -> StageRecord:
 
 
 def _dynamics(session: Session) -> StageRecord:
-    """Return the content of report and certificate on the dynamics; the verdict is on the exported robot."""
+    """Return the content of report and certificate on the dynamics of a session.
+
+    The verdict is that on the exported robot.
+    """
     from calib.procedure.report import dynamics_section
 
     report = dynamics_section.read(session.identification.path)
@@ -120,7 +123,8 @@ def _dynamics(session: Session) -> StageRecord:
     predicted = prediction(session.path(session.export))
     delivered = None if predicted is None else predicted.exported
     exported = read_state(session).notes("export")
-    section = dynamics_section.report_section(report, figures, exported, allowed, delivered)
+    tolerances = session.settings.dynamics.tolerance_torque
+    section = dynamics_section.report_section(report, figures, exported, allowed, delivered, tolerances)
     verdict = session.verdicts().stages["dynamics"]
     section = replace(section, verdict=verdict.level, reason=verdict.reason)
     stage = dynamics_pages.stage(report, section, session.plots, allowed)
@@ -128,7 +132,7 @@ def _dynamics(session: Session) -> StageRecord:
 
 
 def _validated_report(session: Session) -> fit_report.Report:
-    """Return the report on the fit, including the results of the step ``validate``."""
+    """Return the report on a session's fit, including the results of the step ``validate``."""
     validation = session.validation
     metrics = validation.metrics()
     if metrics.schema >= SCHEMA:
@@ -222,11 +226,13 @@ def _setup(session: Session, metrics: FitMetrics | None) -> list[Entry]:
         allowed = "none given: pass below 10 %"
         if section.tolerance_percent:
             allowed = f"{section.tolerance_percent:g} % on unseen motion"
+        joint_tolerances = ", ".join(f"{tolerance:g}" for tolerance in section.tolerance_torque)
         payloads = ", ".join(_payloads(session))
         rows += [
             ("recordings", _names(session.brought("training", "unseen"))),
             ("torques", TORQUES[section.torques]),
             ("tolerance of torque", allowed),
+            ("tolerance of joints' torques, rms", joint_tolerances and f"{joint_tolerances} N m or N"),
             ("payloads", payloads),
         ]
     rows += [
@@ -238,7 +244,12 @@ def _setup(session: Session, metrics: FitMetrics | None) -> list[Entry]:
 
 
 def _instrument(session: Session, metrics: FitMetrics) -> str:
-    """Return a text on the instrument: name, measured quantity (as stated, and as used), and σ."""
+    """Return a text on a session's instrument: name, measured quantity (as stated, and as used), and σ.
+
+    Args:
+        session: the session.
+        metrics: metrics of the fit, which state the measured quantities that were used.
+    """
     instrument = session.settings.instrument
     with_orientation = metrics.fit.calibrated.orientation_deg is not None
     measures = f"measures {instrument.measures}"
@@ -255,7 +266,7 @@ def _instrument(session: Session, metrics: FitMetrics) -> str:
 
 
 def _payloads(session: Session) -> Iterator[str]:
-    """Yield for each payload its label, what was stated of it, and its identified mass."""
+    """Yield for each payload of a session its label, what was stated of it, and its identified mass."""
     identified = {}
     if session.settings.dynamics.payloads and (session.identification.path / ESTIMATE).exists():
         identified = {row.name: row for row in read_estimate(session.identification.path)}
@@ -269,7 +280,10 @@ def _payloads(session: Session) -> Iterator[str]:
 
 
 def _names(paths: list[Path]) -> str:
-    """Return the names of files as one text, without dates, since copying changes the date of a file."""
+    """Return the names of the files `paths` as one text.
+
+    Dates are omitted, since copying changes the date of a file.
+    """
     return ", ".join(path.name for path in paths)
 
 
@@ -290,7 +304,11 @@ def _session_plan(session: Session) -> _Plan:
 
 
 def _filed(paths: list[Path]) -> list[Path]:
-    """Return the measured files for the certificate's list; the file of detected corners represents an image folder."""
+    """Return the measured files for the certificate's list; the file of detected corners represents an image folder.
+
+    Args:
+        paths: the measured files.
+    """
     archived = []
     joints = []
     for path in paths:
@@ -305,7 +323,10 @@ def _filed(paths: list[Path]) -> list[Path]:
 
 
 def listed(session: Session) -> list[FileRow]:
-    """Return name, role, size [bytes] and SHA-256 of the files in the certificate, the most important ones first."""
+    """Return name, role, size [bytes] and SHA-256 of the files in a session's certificate.
+
+    The most important files are first.
+    """
     judged_files = {}
     if session.path(VERDICT).exists():
         judged_files = read_json(session.path(VERDICT)).get("files", {})
@@ -339,7 +360,7 @@ def listed(session: Session) -> list[FileRow]:
 
 
 def _archive(session: Session) -> list[Path]:
-    """Return the paths of the files that the certificate lists, the most important ones first."""
+    """Return the paths of the files that a session's certificate lists, the most important ones first."""
     exported = sorted(path for path in session.path(session.export).glob("*") if path.is_file())
     exported.sort(key=lambda path: path.name != URDF)
     paths = [*exported[:1], session.robot_file]
@@ -380,7 +401,7 @@ STEP = SessionStep(
         StepSetting("instrument"),
         StepSetting("poses"),
         StepSetting("fit"),
-        StepSetting("dynamics", ("torques", "payloads", "tolerance_percent")),
+        StepSetting("dynamics", ("torques", "payloads", "tolerance_percent", "tolerance_torque")),
         StepSetting("certificate"),
     ),
 )

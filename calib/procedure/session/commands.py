@@ -65,11 +65,16 @@ def asks(session: Session, state: State) -> tuple[str, str]:
         task, file = _to_measure(session, step)
     else:
         return f"step {step} needs {state.words}", f"put it into {session.folder} and run {next_command} again"
-    return task, f"Bring {file}; then: {next_command}"
+    return task, f"Provide {file}; then: {next_command}"
 
 
 def _to_measure(session: Session, step: str) -> tuple[str, str]:
-    """Return two texts: the poses to measure at the robot, and the files of measurements or images to provide."""
+    """Return two texts: the poses to measure at the robot, and the files of measurements or images to provide.
+
+    Args:
+        session: the session.
+        step: the step that waits: ``measure``, or the step for validation poses.
+    """
     settings, joints = session.settings, chain_of(session).joint_names
     instrument, images = settings.instrument, settings.instrument.measures == IMAGES
     lists = [POSES] if step == "measure" else [UNSEEN]
@@ -114,7 +119,12 @@ def _to_measure(session: Session, step: str) -> tuple[str, str]:
 
 
 def _planned_poses(session: Session, lists: Sequence[str]) -> list[str]:
-    """Return a text on each existing list of planned poses: number of poses, file, and robot programs."""
+    """Return a text on each existing list of planned poses: number of poses, file, and robot programs.
+
+    Args:
+        session: the session.
+        lists: file names of the lists in ``2-poses``.
+    """
     if not session.settings.poses.plan:
         return []
     planned = []
@@ -138,7 +148,12 @@ def _numbered(*parts: str) -> str:
 
 
 def _to_record(session: Session, step: str) -> tuple[str, str]:
-    """Return two texts: the motions to play, and the logs to provide."""
+    """Return two texts: the motions to play, and the logs to provide.
+
+    Args:
+        session: the session.
+        step: the step that waits: ``record``, or the step for the validation motion.
+    """
     section, joints = session.settings.dynamics, chain_of(session).joints
     names = []
     missing = unrecorded_payloads(session) if step == "record" else []
@@ -171,7 +186,13 @@ def _to_record(session: Session, step: str) -> tuple[str, str]:
 
 
 def _to_play(session: Session, names: Sequence[str], payloads: Sequence[str]) -> str:
-    """Return how to play the designed motions of these names, and again with each payload of these labels."""
+    """Return a text that explains how to play designed motions.
+
+    Args:
+        session: the session.
+        names: names of the motions, which are folders in ``6-excitation``.
+        payloads: labels of payloads with which the motions are played again.
+    """
     section = session.settings.dynamics
     file = RUN if section.repeats > 1 else SAMPLES
     motions = " and, into a separate file, ".join(str(session.path(f"6-excitation/{name}/{file}")) for name in names)
@@ -362,7 +383,11 @@ def _ending(session: Session) -> tuple[str, ...]:
 
 
 def status_lines(folder: Path) -> Iterator[RenderableType]:
-    """Yield lines on the status of every step of a session, and on the next task or command."""
+    """Yield lines on the status of every step of a session, and on the next task or command.
+
+    Args:
+        folder: folder of the session.
+    """
     session = open_session(folder)
     settings, states = session.settings, steps.states(session)
     pending = [state for state in states if state.kind not in (DONE, KEPT)]
@@ -382,7 +407,7 @@ def status_lines(folder: Path) -> Iterator[RenderableType]:
 
 
 def noted(folder: Path) -> list[str]:
-    """Return the notes of all completed steps of a session, each beginning with the name of the step."""
+    """Return the notes of all completed steps of the session in a folder, each beginning with the step's name."""
     lines = []
     for name, record in read_state(open_session(folder)).steps.items():
         lines += [f"  {name}: {note}" for note in record.notes]

@@ -141,20 +141,26 @@ def repeats(
         again: measurements from files whose names start with drift.
         sigma: σ of one position, per axis [m]; 0: unknown, so that the drift is stated but not judged.
     """
-    pairs = [(later.file, "again at the end", drift_of(chain, later, blocks)) for later in again]
-    pairs += [(block.file, "more than once", drift_of(chain, block)) for block in blocks]
-    return [
-        finding(
-            "poses-moved" if sigma and found.exceeds(sigma) else "poses-repeat",
+    drifts = [(later.file, "again at the end", drift_of(chain, later, blocks)) for later in again]
+    drifts += [(block.file, "more than once", drift_of(chain, block)) for block in blocks]
+    noise = None
+    if sigma:
+        noise = noise_of_difference(sigma)
+    findings = []
+    for file, when, drift in drifts:
+        if drift is None:
+            continue
+        beyond_noise = bool(sigma) and drift.exceeds(sigma)
+        drift_finding = finding(
+            "poses-moved" if beyond_noise else "poses-repeat",
             file=Path(file).name,
             when=when,
-            poses=found.poses,
-            rms=found.rms,
-            noise=noise_of_difference(sigma) if sigma else None,
+            poses=drift.poses,
+            rms=drift.rms,
+            noise=noise,
         )
-        for file, when, found in pairs
-        if found is not None
-    ]
+        findings.append(drift_finding)
+    return findings
 
 
 def drift_of(chain: Chain, later: PoseMeasurements, first: Sequence[PoseMeasurements] | None = None) -> Drift | None:
@@ -188,8 +194,7 @@ def drift_of(chain: Chain, later: PoseMeasurements, first: Sequence[PoseMeasurem
 def trends(
     chain: Chain, blocks: Sequence[PoseMeasurements], again: Sequence[PoseMeasurements] = (), sigma: float = 0.0
 ) -> list[Trend]:
-    """Return the target's motion with time and with each temperature in the files; an empty list without repeated
-    poses.
+    """Return the target's motion with time and with each temperature in the files; empty without repeated poses.
 
     Args:
         chain: the nominal arm.
@@ -225,7 +230,7 @@ def trends(
 
 
 def _poses(key: np.ndarray) -> np.ndarray:
-    """Return for each row the index (m,) of the first row with nearly the same pose.
+    """Return for each row the index (m,) of the first row with the same pose, up to a difference of `SAME`.
 
     Args:
         key: (m, k) joint values, and scaled indices of target and station.
@@ -234,7 +239,13 @@ def _poses(key: np.ndarray) -> np.ndarray:
 
 
 def _one_clock(times: Sequence[np.ndarray]) -> bool:
-    """Return whether the time ranges of files do not overlap; they overlap if each file counts from its own start."""
+    """Return whether the time ranges of files do not overlap, so that the files can have one clock.
+
+    They overlap if each file counts from its own start.
+
+    Args:
+        times: times of the rows of each file [s].
+    """
     spans = sorted((each.min(), each.max()) for each in times)
     return all(one[1] <= two[0] for one, two in pairwise(spans))
 
@@ -257,8 +268,7 @@ def _trend(what: str, unit: str, x: np.ndarray, off: np.ndarray, pose: np.ndarra
 
 
 def _columns(path: Path, rows: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
-    """Return time [h] and temperatures [°C] of a file's rows: column name -> unit and values (m,); empty without
-    columns.
+    """Return time [h] and temperatures [°C] of a file's rows: column name -> unit and values (m,).
 
     Args:
         path: the file.
@@ -279,7 +289,12 @@ def _covariates(table: Table) -> Iterator[tuple[str, str, np.ndarray]]:
 
 
 def _seconds(cells: np.ndarray, unit: str) -> np.ndarray | None:
-    """Return the times [s] in a column: numbers in a unit of `TIMES`, or dates in ISO 8601; None for other columns."""
+    """Return the times [s] in a column: numbers in a unit of `TIMES`, or dates in ISO 8601; None for other columns.
+
+    Args:
+        cells: (m,) cells of the column.
+        unit: unit in the column's header.
+    """
     if cells.dtype == float:
         return TIMES[unit] * cells if unit in TIMES and np.isfinite(cells).all() else None
     try:

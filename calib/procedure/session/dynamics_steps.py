@@ -29,6 +29,7 @@ from calib.identification.checks.recorded_motion import (
 from calib.identification.identify_options import FileSettings, IdentifyOptions, read_options
 from calib.procedure.dynamic_stage import identify as identifying
 from calib.procedure.dynamic_stage import inputs
+from calib.procedure.dynamic_stage.computed_torque import torque_tests
 from calib.procedure.dynamic_stage.identify import DynamicsAssessment, assess
 from calib.procedure.excitation import coefficients, prediction, stored_front
 from calib.procedure.excitation.coefficients import Periodic
@@ -83,6 +84,10 @@ def _labels_in(name: str, labels: Iterable[str]) -> tuple[str, ...]:
     """Return the labels that are words of a recording's name, such as ``load`` of ``training_load_log``.
 
     Digits may follow a label, as in ``training_load2_log``, unless the longer word is a label, too.
+
+    Args:
+        name: file name of the recording.
+        labels: labels of all payloads.
     """
     words = []
     for label in labels:
@@ -104,7 +109,12 @@ def unrecorded_payloads(session: Session) -> list[str]:
 
 
 def excite(session: Session, say: Say) -> list[str | Note]:
-    """Design the training motion and the validation motion, and return notes."""
+    """Design the training motion and the validation motion of a session, and return notes.
+
+    Args:
+        session: the session.
+        say: called with progress texts.
+    """
     section = session.settings.dynamics
     if not section.plan:
         return ["no motion was designed, since plan = false: the recordings may contain any motions"]
@@ -136,9 +146,10 @@ def _training_settings(session: Session) -> ExcitationSettings:
 
 
 def _validation_settings(session: Session) -> ExcitationSettings:
-    """Return the settings of the validation motion.
+    """Return the settings for the design of a session's validation motion.
 
-    The motion has another period and seed than the training motion, and states within those of the training motion.
+    The motion has another period and seed than the training motion, and stays within its range of positions, velocities
+    and accelerations.
     """
     section = session.settings.dynamics
     return replace(
@@ -158,6 +169,11 @@ def _validation_settings(session: Session) -> ExcitationSettings:
 def pick_motion(number: int, session: Session, say: Say) -> list[str | Note]:
     """Make motion `number` of the front the training motion, design the validation motion for it, and return notes.
 
+    Args:
+        number: number of the motion in the front, from 1.
+        session: the session.
+        say: called with progress texts.
+
     Raises:
         UsageError: if the training motion has no front, or no such motion.
     """
@@ -171,7 +187,15 @@ def pick_motion(number: int, session: Session, say: Say) -> list[str | Note]:
 def _design(
     session: Session, name: str, settings: ExcitationSettings, say: Say, picked: StoredFront | None = None
 ) -> list[str | Note]:
-    """Design a motion, write its folder, and return notes; figures and details of the training motion alone."""
+    """Design a motion, write its folder, and return notes; only the training motion gets figures and details.
+
+    Args:
+        session: the session.
+        name: name of the motion and of its folder in ``6-excitation``.
+        settings: settings of the design.
+        say: called with progress texts.
+        picked: front with a stored motion that is taken instead of a search; None: search.
+    """
     from calib.procedure.excitation import design
     from calib.procedure.excitation import folder as motion_folder
 
@@ -213,7 +237,7 @@ def _design(
 
 
 def record(session: Session, say: Say) -> list[str]:
-    """Check the training recordings, and return notes for the user."""
+    """Check the training recordings of a session, and return notes for the user."""
     cuts = {}
     notes = []
     for path in session.brought("training"):
@@ -328,6 +352,10 @@ def _other_motion(recording: Recording, motion: DesignedMotion, change: Change |
 def check_torques(recording: Recording, chain: Chain) -> None:
     """Compare recorded torques with the gravity and inertia torques of the nominal masses.
 
+    Args:
+        recording: the recording.
+        chain: the arm with its nominal masses.
+
     Raises:
         MeasurementError: if torques of heavily loaded joints have the opposite sign, or another magnitude.
     """
@@ -363,7 +391,7 @@ def designed_motions(session: Session) -> dict[str, Periodic]:
 
 
 def next_round(session: Session) -> str:
-    """Return the name of the next further motion: round2, or round3 if a log of round2 exists, and so on."""
+    """Return the name of a session's next further motion: round2, or round3 if a log of round2 exists, and so on."""
     number = 2
     while _logs_of(session, f"{ROUND}{number}"):
         number += 1
@@ -371,7 +399,7 @@ def next_round(session: Session) -> str:
 
 
 def _logs_of(session: Session, name: str) -> list[Path]:
-    """Return the training recordings whose file names begin with the name of a further motion."""
+    """Return the training recordings of a session whose file names begin with `name`, that of a further motion."""
     return [path for path in session.brought("training") if path.stem.lower().startswith(name)]
 
 
@@ -394,7 +422,10 @@ def _cut_paths(paths: list[Path], cuts: Cuts) -> list[str]:
 
 
 def _divided(session: Session) -> tuple[list[str], list[str]]:
-    """Return training recordings and held-out parts of recordings, as paths with time ranges (``log.csv@0:9``)."""
+    """Return a session's training recordings and the held-out parts of recordings.
+
+    Both are paths with time ranges (``log.csv@0:9``).
+    """
     cuts = read_json(session.path(CUTS), "calib redo recreates it", Cuts)
     share = session.settings.dynamics.holdout
     training = session.brought("training")
@@ -412,7 +443,13 @@ def _divided(session: Session) -> tuple[list[str], list[str]]:
 def _gathered(
     session: Session, training: Sequence[str], unseen: Sequence[str], say: Say
 ) -> inputs.IdentificationInputs:
-    """Return the inputs of the identification: calibrated robot, training recordings, and held-out recordings."""
+    """Return the inputs of the identification: calibrated robot, training recordings, and held-out recordings.
+
+    Args:
+        session: the session.
+        training, unseen: recordings as paths with time ranges.
+        say: called with progress texts.
+    """
     motions = designed_motions(session)
     options = options_of(session)
     # the options of a recording of the session that is not read here do not apply
@@ -431,7 +468,7 @@ def _gathered(
 
 
 def identify(session: Session, say: Say) -> list[str | Note]:
-    """Identify base parameters and friction on the calibrated geometry; held-out recordings are not used.
+    """Identify a session's base parameters and friction on the calibrated geometry; held-out recordings are not used.
 
     Returns:
         Notes for the user.
@@ -471,7 +508,7 @@ def identify(session: Session, say: Say) -> list[str | Note]:
 
 
 def predict(session: Session, say: Say) -> list[str | Note]:
-    """Validate the identified model on held-out motion, write the verdict, and return notes for the user."""
+    """Validate a session's identified model on held-out motion, write the verdict, and return notes for the user."""
     training, held_out = _divided(session)
     unseen = session.brought("unseen")
     notes = []
@@ -485,17 +522,21 @@ def predict(session: Session, say: Say) -> list[str | Note]:
     assessment = assess(gathered, folder.dynamics(), folder.findings(), folder.errors(), progress=say)
     # the export is judged by the torques written here
     folder.unseen.write(gathered, assessment)
-    assessment = replace(assessment, verdict=_as_delivered(session, assessment))
+    assessment = replace(assessment, verdict=_as_delivered(session, gathered, assessment))
     folder.unseen.write(gathered, assessment)
     earlier = folder.metrics().warnings
     new_warnings = [warning for warning in assessment.warnings if warning not in earlier]
     return [*notes, str(assessment.verdict), *as_notes(new_warnings, assessment.noticed)]
 
 
-def _as_delivered(session: Session, assessment: DynamicsAssessment) -> Verdict:
+def _as_delivered(session: Session, gathered: inputs.IdentificationInputs, assessment: DynamicsAssessment) -> Verdict:
     """Return the verdict on the exported robot; for a model that cannot be exported, pass becomes prediction only.
 
     The verdict is fail if the torque error exceeds the tolerance in ``session.toml``.
+
+    Args:
+        session: the session, with the tolerance.
+        assessment: errors of the exported robot's model on the recordings, and the verdict.
     """
     from calib.procedure.export.delivery import Export
 
@@ -513,8 +554,17 @@ def _as_delivered(session: Session, assessment: DynamicsAssessment) -> Verdict:
         error, model = predicted.exported, "exported robot"
         figure = f"{error:.2f} % of the torque unexplained by the exported robot"
         verdict = replace(verdict, reason=f"{figure} (identified model: {verdict.reason})")
-    tolerance = session.settings.dynamics.tolerance_percent
-    if not tolerance or error <= tolerance:
+    section = session.settings.dynamics
+    excesses = []
+    if section.tolerance_percent and error > section.tolerance_percent:
+        excesses.append(
+            f"the {model} has an error of {error:.2f} %, above the tolerance of {section.tolerance_percent:g} %"
+        )
+    rows = gathered.options.settings.torque_rows.titles(gathered.chain.joint_names)
+    tests = torque_tests(section.tolerance_torque, assessment.proofs, rows)
+    failed = [f"{test.row} {test.rms:.3g} (tolerance {test.tolerance:g})" for test in tests if not test.passed]
+    if failed:
+        excesses.append(f"rms torque errors [N m or N] of the identified model above tolerance: {', '.join(failed)}")
+    if not excesses:
         return verdict
-    excess = f"the {model} has an error of {error:.2f} %, above the tolerance of {tolerance:g} %"
-    return Verdict("fail", f"{verdict.reason}; {excess}")
+    return Verdict("fail", "; ".join([verdict.reason, *excesses]))

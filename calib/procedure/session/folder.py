@@ -91,7 +91,14 @@ Say = Callable[[str], None]
 class StepRecord:
     """Record of a completed step in ``state.json``.
 
-    It contains time, version, notes, and fingerprints of inputs and outputs (SHA-256 of files, values of settings).
+    Attributes:
+        finished: date and time at which the step was completed, ISO 8601.
+        inputs, outputs: name of a file or setting -> fingerprint: SHA-256 of the file, or value of the setting as JSON.
+        seconds: duration of the step [s].
+        command: command that ran the step.
+        seed: seed of all random numbers.
+        toolkit: versions of the toolkit and its libraries.
+        notes: notes for the user.
     """
 
     finished: Text
@@ -138,8 +145,10 @@ class Session:
         return older if older.exists() else self.folder / name
 
     def named(self, name: str) -> Path | None:
-        """Return the path of a file whose name is the value of a key in ``session.toml``; None if
-        the value is empty.
+        """Return the path of a file that a key in ``session.toml`` names.
+
+        Args:
+            name: value of the key; empty: there is no file, and None is returned.
         """
         return self.path(name) if name else None
 
@@ -317,6 +326,10 @@ def create(folder: Path, robot_file: Path, settings: SessionSettings, copied: Ma
 
 def open_session(folder: Path, plots: bool = True) -> Session:
     """Read the settings of the session in a folder.
+
+    Args:
+        folder: the folder.
+        plots: whether the session's steps draw figures.
 
     Raises:
         SessionError: if the folder is not a session, was made by a newer version, or has a damaged ``session.toml``.

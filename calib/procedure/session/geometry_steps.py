@@ -6,7 +6,7 @@ A session selects two sets of poses: optimised poses for the fit, and random pos
 import shutil
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -40,7 +40,7 @@ from calib.procedure.kinematic_stage import fit as fitting
 from calib.procedure.kinematic_stage import folder as outputs
 from calib.procedure.kinematic_stage import inputs, selection
 from calib.procedure.kinematic_stage.settings import FitSettings, SelectionSettings
-from calib.procedure.kinematic_stage.validation import assess
+from calib.procedure.kinematic_stage.validation import Assessment, assess
 from calib.procedure.measuring.constraints_file import VIEW_UNCHECKED
 from calib.procedure.measuring.measuring_run import same_turn, write_run
 from calib.procedure.measuring.pose_limits import read_limits
@@ -52,6 +52,7 @@ from calib.procedure.report.geometry_section import error_words, outlier_sentenc
 from calib.procedure.report.outputs import write_fit
 from calib.procedure.session import drift, folder
 from calib.procedure.session.folder import Say, Session
+from calib.records import read_json
 from calib.robot import calibrated
 from calib.robot.chain import Chain, joint_kinds
 from calib.robot.formats.urdf_tree import is_urdf
@@ -70,6 +71,11 @@ WRITE_PROGRAM: Point[Callable[[Path, Path, str], object]] = Point(
 
 def _choose(session: Session, chain: Chain, say: Say) -> list[str]:
     """Select poses by the settings in ``session.toml``, and write poses, visiting order, and predicted σ.
+
+    Args:
+        session: the session.
+        chain: the nominal arm.
+        say: called with progress texts.
 
     Returns:
         Notes for the user.
@@ -139,10 +145,13 @@ def _choose(session: Session, chain: Chain, say: Say) -> list[str]:
 
 
 def _write_pose_lists(session: Session, chain: Chain, q: np.ndarray) -> int:
-    """Write the selected poses for the fit and random poses for the validation, and programs for the robot's
-    controller.
+    """Write the lists of poses to measure, and programs for the robot's controller.
+
+    The lists are the selected poses for the fit, and random poses for the validation.
 
     Args:
+        session: the session.
+        chain: the nominal arm.
         q: (m, n) poses for the fit [rad or m].
 
     Returns:
@@ -160,12 +169,22 @@ def _write_pose_lists(session: Session, chain: Chain, q: np.ndarray) -> int:
 
 
 def _selection_kind(measures: str) -> str:
-    """Return the kind of measurement for pose selection; images count as poses."""
+    """Return the kind of measurement for pose selection.
+
+    Args:
+        measures: quantity that the instrument measures; images (``pixels``) count as poses.
+    """
     return "pose" if measures == IMAGES else measures
 
 
 def _random_poses(session: Session, chain: Chain, count: int) -> np.ndarray:
-    """Return random poses (count, n) [rad or m] within all limits, independent of the poses for the fit."""
+    """Return random poses (count, n) [rad or m] within all limits, independent of the poses for the fit.
+
+    Args:
+        session: the session with its limits and seed.
+        chain: the nominal arm.
+        count: number of poses.
+    """
     cell = targets_of(chain, [session.settings.instrument.tool])
     limits = read_limits(session.named(session.settings.poses.constraints), cell, session.robot_file)
     jacobian = observation(cell, _selection_kind(session.settings.instrument.measures))
@@ -201,7 +220,7 @@ def _options_of(session: Session, paths: Sequence[Path] = ()) -> FitOptions:
 
 
 def _with_sigma(session: Session, options: FileOptions) -> FileOptions:
-    """Return a file's options in which the instrument's σ replace missing σ."""
+    """Return a file's options in which the σ of a session's instrument replace missing σ."""
     instrument, sigma = session.settings.instrument, options.sigma
     if instrument.sigma_position and sigma.position is None:
         sigma = replace(sigma, position=(instrument.sigma_position,) * 3)
@@ -229,7 +248,7 @@ def describe(session: Session, say: Say) -> list[str]:
 
 
 def select(session: Session, say: Say) -> list[str]:
-    """Select poses for the fit and random poses for the validation, and return notes for the user.
+    """Select poses for the fit of a session and random poses for its validation, and return notes for the user.
 
     Raises:
         UsageError: if a pose list contains measurements, which would be overwritten.
@@ -247,7 +266,7 @@ def select(session: Session, say: Say) -> list[str]:
 
 
 def arrive(session: Session, say: Say) -> list[Note]:
-    """Check the measured files for the fit, and return notes for the user."""
+    """Check a session's measured files for the fit, and return notes for the user."""
     chain = chain_of(session)
     blocks = read_measured(session, chain, session.brought("measured"))
     repeated = read_measured(session, chain, session.brought("drift"))
@@ -363,7 +382,12 @@ def _fit_settings(session: Session) -> FitSettings:
 
 
 def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
-    """Return the inputs of the fit: robot, measurements, and the validation files in `validate`."""
+    """Return the inputs of a session's fit: robot, measurements, and validation files.
+
+    Args:
+        session: the session.
+        validate: the validation files; empty: none.
+    """
     measured = session.brought("measured")
     links = session.links
     # the same links whatever joints the files' columns name
@@ -381,7 +405,7 @@ def _gathered(session: Session, validate: Sequence[Path] = ()) -> inputs.Inputs:
 
 
 def fit(session: Session, say: Say) -> list[Note]:
-    """Fit the geometry to the measured files, and return notes for the user; validation files are not used."""
+    """Fit the geometry to a session's measured files, and return notes for the user; validation files are not used."""
     poses = session.path(f"2-poses/{folder.POSES}")
     predicted = None
     if session.settings.poses.plan and beside(poses).exists():
@@ -403,7 +427,10 @@ def fit(session: Session, say: Say) -> list[Note]:
 
 
 def validate(session: Session, say: Say) -> list[Note]:
-    """Validate the fitted robot on held-out poses like `calib fit` with validation files; return notes for the user."""
+    """Validate a session's fitted robot on held-out poses, and return notes for the user.
+
+    The errors are computed as by `calib fit` with validation files.
+    """
     chain, unseen = chain_of(session), session.brought("validation")
     metrics, report = session.fit.metrics(), fit_report.read(session.fit.report)
     # images are read with the lens and board of those of the fit
@@ -424,7 +451,40 @@ def validate(session: Session, say: Say) -> list[Note]:
     validation_metrics = session.validation.write(assessment, gathered, rows)
     fit_report.write(report.with_unseen(validation_metrics, rows), session.validation.report)
     new_warnings = [warning for warning in assessment.warnings if warning not in metrics.warnings]
+    notes += notes_of(_predicted_and_reached(session, assessment))
     return [*notes, Note(str(assessment.verdict)), *as_notes(new_warnings, assessment.noticed)]
+
+
+def _predicted_and_reached(session: Session, assessment: Assessment) -> list[Finding]:
+    """Return the findings that state the reached accuracy of the tool next to the predicted one.
+
+    Args:
+        session: the session, whose selection of poses contains the predicted σ of the tool's position.
+        assessment: errors on held-out poses, whose rms is the reached accuracy.
+
+    Returns:
+        One finding for each set of held-out poses; an empty list without a prediction.
+    """
+    path = session.path(folder.SELECTION)
+    if not session.settings.poses.plan or not path.exists():
+        return []
+    predicted = read_json(path, "repeat the step with `calib redo`", _PredictedTool).tool_sigma
+    if predicted is None:
+        return []
+    findings = []
+    for name, rows in assessment.validation.items():
+        delivered = rows.of_urdf if assessment.deliverable == "urdf" else rows
+        if rows.proves:
+            reached = delivered.errors[1].rms
+            findings.append(finding("tool-accuracy-reached", file=name, reached=reached, predicted=predicted))
+    return findings
+
+
+@dataclass(frozen=True)
+class _PredictedTool:
+    """The key of ``selection.json`` with the predicted σ of the tool's position [m]; None if it is not known."""
+
+    tool_sigma: float | None = None
 
 
 def export(session: Session, say: Say) -> list[str]:
@@ -458,6 +518,11 @@ def _deliver(session: Session, out: Path, say: Say) -> list[str]:
     """Write the exported files of the session's stages, and return remarks for the user.
 
     If the dynamics cannot be exported, only the geometry is written.
+
+    Args:
+        session: the session.
+        out: folder to write into.
+        say: called with progress texts.
     """
     from calib.procedure.export.delivery import FILES, Export, deliver
 
@@ -485,7 +550,7 @@ def _deliver(session: Session, out: Path, say: Say) -> list[str]:
 
 
 def clear_staging(session: Session) -> None:
-    """Remove temporary files and folders of a killed command, but not those of a running upload."""
+    """Remove temporary files of a killed command from a session's folder, but not those of a running upload."""
     for path in session.folder.rglob(".*.part"):
         if files.in_use(path):
             continue

@@ -71,13 +71,13 @@ def return_masses(session: Session) -> list[str]:
         rounds = read_json(record, "calib redo fit", dict[str, int])["rounds"]
     geometry = largest_move(record_path / "geometry", session.fit.path)
     dynamics = largest_move(record_path, identification)
-    message = f"the geometry has moved by {geometry:.2g} σ, the dynamics by {dynamics:.2g} σ"
+    message = f"the geometry has changed by {geometry:.2g} σ, the dynamics by {dynamics:.2g} σ"
     if not (record_path / MODEL).is_file():
         message = "the compliance was fitted to the description's masses"
     settled = max(geometry, dynamics) <= MAX_MOVE
     if settled or rounds >= limit:
         write_json(record, {"rounds": 0})
-        end = "settled" if settled else f"not settled, stopped by rounds = {limit}"
+        end = "converged" if settled else f"not converged, stopped by rounds = {limit}"
         return [f"identified masses in the fit's gravity torques: after {rounds} rounds {message}: {end}"]
     (record_path / "geometry").mkdir(parents=True, exist_ok=True)
     shutil.copy(session.fit.path / ESTIMATE, record_path / "geometry")
@@ -85,4 +85,4 @@ def return_masses(session: Session) -> list[str]:
     # the last is what the fit depends on
     for name in (calibrated.ROBOT, ESTIMATE, MODEL):
         shutil.copy(identification / name, record_path)
-    return [f"identified masses return into the fit, round {rounds + 1} of at most {limit}: {message}"]
+    return [f"the identified masses are used in the fit again, round {rounds + 1} of at most {limit}: {message}"]

@@ -105,7 +105,7 @@ class Question:
                 return camera and (answers.mounting or "").lower() not in UNSAID
             case "dynamics":
                 return not nothing
-            case "torques" | "payloads" | "goals" | "period" | "tolerance_percent":
+            case "torques" | "payloads" | "goals" | "period" | "tolerance_percent" | "tolerance_torque":
                 return answers.dynamics is not False
             case "front":
                 return answers.dynamics is not False and any("=" in goal for goal in answers.goals)
@@ -137,6 +137,7 @@ DEFAULTS = {
     "front": "0",
     "tolerance_mm": "0",
     "tolerance_percent": "0",
+    "tolerance_torque": "none",
     "details": "yes",
 }
 QUESTIONS = _questions()
@@ -179,7 +180,7 @@ def with_answer(answers: Answers, question: Question, text: str) -> Answers:
             value = {"y": True, "n": False}.get(text[:1].lower(), text)
     result = replace(answers, **{name: getattr(parse(Answers, {name: value}, ""), name)})
     if name == "robot":
-        require(text, "a robot is needed", UsageError)
+        require(text, "a robot is needed: a file, or a robot of the library", UsageError)
         resolve(text)
     # what is not answered yet is no error
     checked(replace(result, robot=result.robot or "", instrument=result.instrument or "tracker"))
@@ -193,11 +194,17 @@ def checked(answers: Answers) -> FieldValues:
         UsageError: for an invalid answer.
     """
     robot, instrument = answers.robot, answers.instrument
-    require(robot is not None and instrument is not None, "a robot and an instrument are needed", UsageError)
+    require(
+        robot is not None and instrument is not None,
+        "a robot and an instrument are needed: give --robot and --instrument",
+        UsageError,
+    )
     instrument_named(instrument or "")
     of_camera = [name for name in CAMERA if getattr(answers, name) is not None]
     if of_camera and _measures(answers) != IMAGES:
-        raise CalibError(f"--{of_camera[0]} applies to a camera that takes images; the instrument is {instrument}")
+        raise CalibError(
+            f"--{of_camera[0]} applies to a camera that takes images; the instrument is {instrument}: leave it out"
+        )
     dynamics = answers.dynamics is not False
     for goal in answers.goals:
         checked_goal(goal)
@@ -221,7 +228,7 @@ def checked(answers: Answers) -> FieldValues:
         if answers.cell:
             first = next(iter(answers.cell))
             option = first.replace("_", "-").replace("obstacles", "obstacle")
-            raise UsageError(f"--{option} and --limits both describe the cell; put it into {answers.limits}")
+            raise UsageError(f"--{option} and --limits both describe the cell; state it in {answers.limits} only")
 
     optional = {
         "payloads": stated_payloads(answers.payloads),
@@ -234,6 +241,7 @@ def checked(answers: Answers) -> FieldValues:
         "front": answers.front,
         "tolerance_mm": answers.tolerance_mm,
         "tolerance_percent": answers.tolerance_percent,
+        "tolerance_torque": _joint_tolerances(answers.tolerance_torque or NONE),
     }
     result = {"robot": robot, "instrument": instrument, "dynamics": dynamics, "limits": limits}
     return result | {name: value for name, value in optional.items() if value and value != NONE}
@@ -241,6 +249,9 @@ def checked(answers: Answers) -> FieldValues:
 
 def stated_payloads(texts: Sequence[str]) -> dict[str, dict[str, object]]:
     """Return the payloads of a session by label, from answers such as ``loaded=3.28 at 0,0,0.05``.
+
+    Args:
+        texts: the answers, each ``label``, ``label=kg`` or ``label=kg at x,y,z``.
 
     Raises:
         UsageError: for an invalid answer, or a label that is stated twice.
@@ -255,8 +266,21 @@ def stated_payloads(texts: Sequence[str]) -> dict[str, dict[str, object]]:
     return payloads
 
 
+def _joint_tolerances(text: str) -> list[float]:
+    """Return the tolerances of the joints' torques [N m or N] from numbers with commas; an empty list for "none"."""
+    if _plain(text) in (*UNSAID, NONE):
+        return []
+    message = f"--tolerance-torque {text}: expected a number, or one per joint with commas, e.g. 2,2,1,0.5"
+    with refused_as(UsageError, ValueError, message):
+        return [Real(least=0, quantity="1").read(part) for part in text.split(",")]
+
+
 def _payload(text: str) -> tuple[str, dict[str, object]]:
-    """Return label and keys of a payload, given as ``label``, ``label=kg`` or ``label=kg at x,y,z``."""
+    """Return label and keys of a payload.
+
+    Args:
+        text: ``label``, ``label=kg`` or ``label=kg at x,y,z`` with the centre of mass in the tip's frame [m].
+    """
     labelled_mass, _, position = text.partition(" at ")
     label, equals, mass = (part.strip() for part in labelled_mass.partition("="))
     payload: dict[str, object] = {}
@@ -314,7 +338,7 @@ def cell_tables(**answers: str | Sequence[str] | None) -> dict[str, object]:
             value = read(text, texts) if name in ("carried", "stands") else read(text)
         except ValueError as error:
             option = "obstacle" if name == "obstacles" else name.replace("_", "-")
-            raise UsageError(f"--{option} {text}: {error}, or unknown") from None
+            raise UsageError(f"--{option} {text}: {error}, or the word unknown") from None
         if key:
             tables[table] = tables.get(table, {}) | {key: value}
         else:
@@ -348,7 +372,10 @@ def _direction(text: str) -> str | list[float]:
 
 
 def _box(text: str) -> list[list[float]]:
-    """Return the ranges along x, y and z of a box around the robot [m], given as ``x,x,y,y,z,z``.
+    """Return the ranges along x, y and z of a box around the robot [m].
+
+    Args:
+        text: the answer, ``x,x,y,y,z,z``.
 
     Raises:
         ValueError: for another form, or if the base is outside the box.
@@ -438,7 +465,7 @@ def _turned(name: str, most: float, text: str, answers: dict[str, str]) -> dict[
 
 
 def _cone(text: str) -> str:
-    """Return the half angle of a cone with its unit; an angle without a unit is in degrees."""
+    """Return the half angle `text` of a cone with its unit; an angle without a unit is in degrees."""
     return text if any(map(str.isalpha, text)) else f"{text} deg"
 
 

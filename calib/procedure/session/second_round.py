@@ -74,7 +74,11 @@ class _ShortParameter(NamedTuple):
 
 
 def extend(session: Session, say: Say) -> list[str]:
-    """Design a further motion if joints or parameters do not meet the requested accuracy.
+    """Design a further motion if joints or parameters of a session do not meet the requested accuracy.
+
+    Args:
+        session: the session.
+        say: called with progress texts.
 
     Returns:
         Notes on the predicted benefit.
@@ -134,6 +138,10 @@ def _short_joints(session: Session, tolerance: float) -> list[_ShortParameter]:
     """Return the joints whose motor torque error exceeds the tolerance [%] on the worst recording.
 
     Empty if the error of all torques together is within the tolerance.
+
+    Args:
+        session: the session with its identification.
+        tolerance: largest accepted torque error of a joint [%].
     """
     report = session.identification.unseen.read()
     recordings = (report.proofs or report.fit).values()
@@ -156,6 +164,10 @@ def _weak_parameters(session: Session, tolerance: float) -> tuple[str, ...]:
     """Return the names of essential parameters whose relative σ [%] exceeds the tolerance.
 
     Parameters that the design of a motion cannot take into account are excluded.
+
+    Args:
+        session: the session with its identification.
+        tolerance: largest accepted standard deviation [%] of the parameter's value.
     """
     identification = session.identification
     without = {column.name for column in identification.dynamics().model.columns if not column.form.slopes}
@@ -168,11 +180,16 @@ def _weak_parameters(session: Session, tolerance: float) -> tuple[str, ...]:
 
 
 def _unmodelled(inputs: ExcitationInputs, joints: list[_ShortParameter]) -> list[str]:
-    """Return a note on the joints whose torque error more motion does not reduce; an empty list without such joints."""
+    """Return a note on the joints whose torque error more motion does not reduce; an empty list without such joints.
+
+    Args:
+        inputs: robot and model.
+        joints: joints with too large torque errors.
+    """
     if not joints:
         return []
     names = listing(f"{inputs.chain.joint_names[joint.joint]} {joint.error:.2g} %" for joint in joints)
-    return [f"more motion does not help {names}: what is left is not modelled (friction, elasticity)"]
+    return [f"more motion does not reduce the torque errors of {names}: they are unmodelled effects"]
 
 
 def _gains(designed: design.Designed, joints: list[_ShortParameter], parameters: tuple[str, ...]) -> list[str]:
@@ -198,7 +215,7 @@ def _gains(designed: design.Designed, joints: list[_ShortParameter], parameters:
         if row.name in parameters and row.value and row.sigma_before and row.rsd is not None:
             before = 100.0 * row.sigma_before / abs(row.value)
             parts.append(f"σ of {row.name} from {before:.2g} to {row.rsd:.2g} %")
-    return [f"{seconds:.0f} s more, of a motion designed for it, bring the {listing(parts, 6)}"]
+    return [f"a further motion of {seconds:.0f} s, designed for this, is expected to change {listing(parts, 6)}"]
 
 
 def promised(session: Session) -> tuple[str, ...]:
@@ -216,12 +233,16 @@ def promised(session: Session) -> tuple[str, ...]:
     played = folder / SAMPLES
     if session.settings.dynamics.repeats > 1:
         played = folder / RUN
-    task = f"play {played}, bring its log as {session.path(f'7-recorded/{name}_log.csv')}; then: "
+    task = f"play {played}, put its log into {session.path(f'7-recorded/{name}_log.csv')}; then: "
     return (notes[0], f"if wanted, {task}{command_line('next', session.folder)}")
 
 
 def _short_of_default(session: Session) -> tuple[str, ...]:
-    """Return a line on joints and parameters below the default accuracy, and on how to request a further motion."""
+    """Return a line on joints and parameters below the default accuracy, and on how to request a further motion.
+
+    Args:
+        session: a session with an identification.
+    """
     joints = _short_joints(session, NEED)
     weak = _weak_parameters(session, NEED)
     names = load_calibrated(session.fit.path).chain.joint_names

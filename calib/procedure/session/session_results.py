@@ -8,7 +8,7 @@ from calib.procedure.session.folder import SETTINGS, Session
 
 
 def _on_this_machine(address: str) -> list[str]:
-    """Return an empty list: an address that is a path on this machine is a single folder."""
+    """Return an empty list: `address` is a path on this machine and thus a single folder."""
     return []
 
 
@@ -40,9 +40,9 @@ def folders_of(
 
 
 def position_errors(session: Session) -> tuple[float, float] | None:
-    """Return the rms position errors [mm] of nominal and calibrated robot on the held-out poses with the largest error.
+    """Return the rms position errors [mm] of nominal and calibrated robot on a session's held-out poses.
 
-    None without a fit or held-out poses.
+    Of several sets of poses, the one with the largest error is used. None without a fit or held-out poses.
     """
     if not session.geometric:
         return None
@@ -58,7 +58,7 @@ def position_errors(session: Session) -> tuple[float, float] | None:
 
 
 def torque_error(session: Session) -> float | None:
-    """Return the unexplained share of the torque [%] on the held-out motion with the largest error.
+    """Return the unexplained share of the torque [%] on a session's held-out motion with the largest error.
 
     Without held-out motion, the error on the training motion; None without dynamics.
     """

@@ -176,6 +176,13 @@ class FitSection:
     rounds: Annotated[int, Whole(0, 20)] = 3
 
 
+def _as_list(value: object) -> object:
+    """Return a number as a list with it; other values unchanged."""
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return [value]
+    return value
+
+
 @strict
 @dataclass(frozen=True)
 class DynamicsSection:
@@ -201,6 +208,8 @@ class DynamicsSection:
         holdout: share at the end of each recording that is held out if there is no validation recording; 0:
             none
         tolerance_percent: largest accepted torque error of the exported robot on unseen motion [%]; 0: none
+        tolerance_torque: largest accepted rms error of each joint's torque on unseen motion [N m or N]: one number per
+            joint (0: none), or one for all joints; []: none
         sigma_percent: largest standard deviation of essential parameters that is wanted [%]; 0: none. Where joints are
             above tolerance_percent, or parameters above this, a further motion is designed (6-excitation/round2);
             with neither stated, the session's end names what is above 10 %
@@ -227,6 +236,7 @@ class DynamicsSection:
     options: Beside = ""
     holdout: Holdout = 0.0
     tolerance_percent: NotNegative = 0.0
+    tolerance_torque: Annotated[tuple[NotNegative, ...], Checked(_as_list)] = ()
     sigma_percent: NotNegative = 0.0
     payloads: Mapping[str, Annotated[Payload, Checked(mass_as_payload)]] = field(default_factory=dict)
 
@@ -234,8 +244,8 @@ class DynamicsSection:
         _check_labels(self.payloads)
         if self.repeats > MAX_SAMPLES / max(self.period * self.rate, 1e-300):  # a quotient: repeats may be huge
             raise ValueError(
-                f"period {self.period:g} s at rate {self.rate:g} Hz, repeated {self.repeats} times: more than "
-                f"{MAX_SAMPLES:.0e} samples"
+                f"period {self.period:g} s at rate {self.rate:g} Hz, repeated {self.repeats} times, is more than "
+                f"{MAX_SAMPLES:.0e} samples: lower one of them"
             )
 
 
@@ -272,7 +282,7 @@ class SessionSettings:
 
 
 def read_settings(path: Path) -> SessionSettings:
-    """Read ``session.toml``; missing keys get their defaults, and files of schema 1 get no dynamics.
+    """Read ``session.toml`` at `path`; missing keys get their defaults, and files of schema 1 get no dynamics.
 
     Raises:
         SessionError: if the file was made by a newer version, is damaged, or has an invalid value.
@@ -324,7 +334,12 @@ def written(settings: SessionSettings) -> str:
 
 
 def _lines(section: "DataclassInstance | type[DataclassInstance]", prefix: str = "") -> Iterator[str]:
-    """Yield the lines of a section: first keys with comments aligned in one column, then tables."""
+    """Yield the lines of a section: first keys with comments aligned in one column, then tables.
+
+    Args:
+        section: the section, or its class for the default values.
+        prefix: names of the sections that contain it, each followed by a dot; empty: none.
+    """
     comments = described(type(section))
     tables = []
     for key in fields(section):

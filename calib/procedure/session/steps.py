@@ -74,7 +74,7 @@ class FitFile:
     optional: bool = False
 
     def paths(self, session: Session) -> list[Path]:
-        """Return the path of the file as a list."""
+        """Return the path of the file in a session's folder of the fit, as a list."""
         return [session.fit.path / self.name]
 
 
@@ -86,7 +86,7 @@ class ExportedFile:
     optional: bool = False
 
     def paths(self, session: Session) -> list[Path]:
-        """Return the path of the file as a list; empty if no geometry is fitted."""
+        """Return the path of the file in a session's export, as a list; empty if the session fits no geometry."""
         return [session.path(f"{session.export}/{self.name}")] if session.geometric else []
 
 
@@ -99,7 +99,7 @@ class NamedFile:
     optional: bool = False
 
     def paths(self, session: Session) -> list[Path]:
-        """Return the path of the file as a list; empty if the key is empty."""
+        """Return the path of the file that a session's settings name, as a list; empty if the key is empty."""
         name = getattr(getattr(session.settings, self.section), self.key)
         return [session.path(name)] if name else []
 
@@ -112,7 +112,7 @@ class UserFiles:
     optional: bool = False
 
     def paths(self, session: Session) -> list[Path]:
-        """Return the paths of the files, including files in folders that the user provided."""
+        """Return the paths of the files in a session's folder, including files in folders that the user provided."""
         return session.files_brought(self.kind)
 
 
@@ -164,14 +164,17 @@ class SessionStep:
     kept: tuple[tuple[str, ...], str] = ((), "")
 
     def inputs(self, session: Session) -> dict[Path, bool]:
-        """Return the files that the step reads: path -> whether the file may be missing."""
+        """Return the files of a session that the step reads: path -> whether the file may be missing."""
         paths = {}
         for source in self.reads:
             paths |= dict.fromkeys(source.paths(session), source.optional)
         return paths
 
     def waits(self, session: Session) -> str:
-        """Return a description of the user's files for which the step waits; empty if no files are missing."""
+        """Return a description of the user's files for which the step of a session waits.
+
+        Empty if no files are missing.
+        """
         kind, words = self.brings
         # a part of the measured poses or recordings may be held out instead
         poses, fit, dynamics = session.settings.poses, session.settings.fit, session.settings.dynamics
@@ -196,7 +199,9 @@ FIT_OPTIONS = NamedFile("fit", "options")
 IDENTIFY_OPTIONS = NamedFile("dynamics", "options")
 # keys of [dynamics] on which the identified model depends
 MODEL_KEYS = ("torques", "friction", "method", "options", "payloads", "holdout")
-# and those of a designed motion
+# keys of [dynamics] on which its verdict depends
+TOLERANCES = ("tolerance_percent", "tolerance_torque")
+# keys of [dynamics] on which a designed motion depends
 DESIGN_KEYS = (
     "plan",
     "validation",
@@ -333,7 +338,7 @@ STEPS = (
         ),
         makes=("8-dynamics/unseen/*",),
         settings=(
-            StepSetting("dynamics", ("plan", "validation", "repeats", "tolerance_percent", *MODEL_KEYS)),
+            StepSetting("dynamics", ("plan", "validation", "repeats", *TOLERANCES, *MODEL_KEYS)),
             StepSetting("seed"),
         ),
         stage="dynamics",
@@ -446,7 +451,7 @@ def _state(session: Session, step: SessionStep, recorded: StateFile) -> State:
 
 
 def _missing(session: Session, step: SessionStep) -> str:
-    """Return a description of the files for which a step waits; empty if no files are missing."""
+    """Return a description of the files for which a step of a session waits; empty if no files are missing."""
     waits = step.waits(session)
     if waits:
         return waits
@@ -457,7 +462,7 @@ def _missing(session: Session, step: SessionStep) -> str:
 
 
 def _fingerprints(session: Session, step: SessionStep) -> dict[str, str]:
-    """Return the fingerprints of the files and settings on which a step depends.
+    """Return the fingerprints of a session's files and settings on which a step depends.
 
     Returns:
         Name -> SHA-256 of the file, or value of the setting as JSON.
@@ -490,7 +495,7 @@ def changed_inputs(before: Mapping[str, str], after: Mapping[str, str]) -> str:
             parts.append(f"{name} is new")
         if name in before and _comparable(name, before[name]) != _comparable(name, mark):
             parts.append(f"{name} has changed")
-    parts += [f"{name} is gone" for name in sorted(before.keys() - after)]
+    parts += [f"{name} was removed" for name in sorted(before.keys() - after)]
     return ", ".join(parts)
 
 
@@ -518,9 +523,17 @@ def _comparable(name: str, mark: str) -> object:
 
 
 def run_next(session: Session, say: Say, progress: Say, command: str = "calib next") -> State | None:
-    """Run steps until one has to wait for the user; return the status of this step, or None if all steps are done.
+    """Run steps of a session until one has to wait for the user.
 
     The caller has to lock the session.
+
+    Args:
+        session: the session, locked.
+        say, progress: functions that print permanent lines, and progress messages.
+        command: the command to record for the steps.
+
+    Returns:
+        The status of the step that waits; None if all steps are done.
     """
     clear_staging(session)
     # the folder of a session with the other stages is missing, or this one has files
@@ -562,7 +575,14 @@ def run_instead(session: Session, step: SessionStep, make: Make, say: Say, progr
 
 
 def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: str) -> None:
-    """Run a step, record it in ``state.json``, and print its notes."""
+    """Run a step, record it in ``state.json``, and print its notes.
+
+    Args:
+        session: the session, locked.
+        step: the step.
+        say, progress: functions that print permanent lines, and progress messages.
+        command: the command for the record.
+    """
     number = [included.name for included in steps_of(session)].index(step.name) + 1
     recorded = read_state(session).without(step.name)
     session.write_state(replace(recorded, running=step.name))
@@ -599,7 +619,7 @@ def _run(session: Session, step: SessionStep, say: Say, progress: Say, command: 
 
 
 def forget(session: Session, step: SessionStep) -> None:
-    """Mark a step and all later steps as not done, so that they run again.
+    """Mark a step and all later steps of a session as not done, so that they run again.
 
     Later steps that selected poses or designed motions are not marked if the user has already measured or recorded
     them.

@@ -138,7 +138,7 @@ class _Tree:
         kind = kinds(int(model.jnt_type[j]))
         if kind not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
             free_or_ball = "free" if kind == kinds.mjJNT_FREE else "ball"
-            advice = "an arm has hinges and slides; give the robot's own file, not a scene with it"
+            advice = "an arm has hinges and slides only; give the robot's own file, not a scene with it"
             refuse_robot(self.where, f"body '{self.bodies[model.jnt_bodyid[j]]}' has a {free_or_ball} joint; {advice}")
         slides = kind == kinds.mjJNT_SLIDE
         limited = bool(model.jnt_limited[j])
@@ -191,9 +191,7 @@ class _Tree:
                 refuse_robot(self.where, f"equality '{name}' closes a loop; describe such a robot as a parallel one")
             offset, ratio, *higher = model.eq_data[k, :5]
             if any(higher):
-                refuse_robot(
-                    self.where, f"equality '{name}' of '{self.joints[follower]}' is no straight line; edit polycoef"
-                )
+                refuse_robot(self.where, f"equality '{name}' of '{self.joints[follower]}' is not linear; edit polycoef")
             follower_reference = model.qpos0[model.jnt_qposadr[follower]]
             leader_reference = model.qpos0[model.jnt_qposadr[leader]]
             urdf_offset = repr(float(follower_reference + offset - ratio * leader_reference))
@@ -201,7 +199,7 @@ class _Tree:
             tied |= {follower, leader}
         for k in range(model.nwrap):
             if model.wrap_type[k] != int(self.mj.mjtWrap.mjWRAP_JOINT) or int(model.wrap_objid[k]) not in tied:
-                refuse_robot(self.where, "a tendon moves it, which a serial arm does not have; take it out of the file")
+                refuse_robot(self.where, "a tendon moves joints of the arm, which is not supported; remove the tendon")
         return mimics
 
 

@@ -48,7 +48,7 @@ def convert(path: str) -> str:
     """
     file, arguments = split(path)
     table = tomllib.loads(shipped_text("calib.robot.descriptions", "universal_robots.toml"))
-    message = f'{file}: say of which type the arm is, in quotes: "{file} {TYPE}:=ur5e" (one of {", ".join(table)})'
+    message = f'{file}: state the type of the arm, in quotes: "{file} {TYPE}:=ur5e" (one of {", ".join(table)})'
     require({*arguments} == {TYPE}, message, RobotError)
     kind = one_of(arguments[TYPE], table, f"{file}: {TYPE}", RobotError)
     nominal, deltas = _nominal(**table[kind]), _deltas(file)
@@ -56,9 +56,7 @@ def convert(path: str) -> str:
     axis_frames = np.array([_beside(axis, near) for axis, near in zip(frames[:6], nominal_frames)])
     deviation = float(np.linalg.norm(axis_frames[:, :3, 3] - nominal_frames[:6, :3, 3], axis=1).max())
     if deviation > FARTHEST:
-        refuse_robot(
-            file, f"with it the axes of a {kind} are up to {1e3 * deviation:.0f} mm from their places: another {TYPE}?"
-        )
+        refuse_robot(file, f"the axes of a {kind} would be {1e3 * deviation:.0f} mm from nominal: is {TYPE} another?")
     root = ET.Element("robot", name=kind)
     ET.SubElement(root, "link", name="base")
     parent, previous_frame = "base", np.eye(4)

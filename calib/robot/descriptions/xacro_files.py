@@ -95,7 +95,7 @@ def expand(path: str) -> str:
             raise cause from None
         reason = " ".join(str(error).split()) or repr(error)
         missing = _MISSING.search(reason)
-        hint = f"; say it behind the file: {missing[1]}:=…" if missing else ""
+        hint = f"; state it after the file: {missing[1]}:=…" if missing else ""
         raise RobotError(f"{_location(xacro, file)}: xacro: {reason}{hint}") from error
     declared = sorted(str(name) for name in arguments.declared)
     for name in stated_arguments:
@@ -142,7 +142,7 @@ def package_folder(name: str, file: Path) -> Path:
             return folder
     refuse_robot(
         file,
-        f"there is no package '{name}' among the folders above it and beside those; say where packages are by "
+        f"there is no package '{name}' among the folders above it and beside those; state where packages are by "
         f"{PACKAGE_PATH}=/folder/that/holds/{name} (several: separated by {os.pathsep})",
     )
 

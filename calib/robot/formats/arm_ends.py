@@ -172,7 +172,7 @@ class _Axes:
             axes_behind = self.depth(body) - self.depth(joint.child)
             for name, _ in self.tree.rigid(joint.child):
                 if TOOL0.search(name) and name not in links:
-                    result.append(f"{name} is not taken: {axes_behind} axes follow it")
+                    result.append(f"{name} is not taken as the end: {axes_behind} axes follow it")
         return tuple(dict.fromkeys(result))
 
     def _reached(self) -> list[str]:
@@ -418,7 +418,7 @@ def _frame(tree: UrdfTree, body: str) -> tuple[str, str]:
         return leaves[0], "the last link"
     if len(leaves) == 1:
         return leaves[0], "the last link that is no gripper or sensor"
-    return body, f"the last moving link ({listing(leaves, 4)} hang on it; --tip takes one of them)"
+    return body, f"the last moving link ({listing(leaves, 4)} are attached to it; choose one by --tip)"
 
 
 def _without_tools(tree: UrdfTree, body: str) -> list[str]:

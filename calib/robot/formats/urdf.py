@@ -207,7 +207,7 @@ def drive(tree: UrdfTree, joint: JointTag) -> tuple[str, float, float]:
         ratio *= mimic.multiplier
         name = mimic.leader
         if name in passed:
-            refuse_robot(where, "it mimics a circle")
+            refuse_robot(where, "its <mimic> leads back to itself")
         if name not in tree.joints:
             refuse_robot(where, f"it mimics '{name}', which is not a joint{suggestion(name, tree.joints)}")
         passed.add(name)

@@ -40,7 +40,7 @@ class DescriptionReader(Protocol):
 
 DESCRIPTIONS: Point[DescriptionReader] = Point("descriptions", "readers of robots' descriptions that are no URDF")
 
-XACRO = "this is a xacro file; name it so (robot.urdf.xacro)"
+XACRO = "this is a xacro file; rename it to end in .xacro (robot.urdf.xacro)"
 _DECLARED = re.compile(rb"""^\s*<\?xml[^>]*?encoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")
 
 _ATTRIBUTE = re.compile(rb"""\s+([^\s=/>]+)\s*=\s*("[^"]*"|'[^']*')""")
@@ -479,8 +479,8 @@ def _fresh(node: Node, names: Iterable[str], where: str) -> str:
         where: text for messages.
     """
     name = node.attributes.get("name", "")
-    require(name, f"{where}, line {node.line}: a <{node.tag}> without a name", RobotError)
-    require(name not in names, f"{where}, line {node.line}: a second {node.tag} named '{name}'", RobotError)
+    require(name, f"{where}, line {node.line}: a <{node.tag}> without a name: add one", RobotError)
+    require(name not in names, f"{where}, line {node.line}: a second {node.tag} named '{name}': rename one", RobotError)
     return name
 
 

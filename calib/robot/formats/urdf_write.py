@@ -232,7 +232,10 @@ def write_new(chain: Chain) -> str:
             continue
         main = k in main_elements
         if main and element.ratio != 1.0:
-            refuse_robot(f"element '{element.name}'", f"a URDF joint moves by q, not by {element.ratio:g} q")
+            refuse_robot(
+                f"element '{element.name}'",
+                f"a URDF joint moves by q, not by {element.ratio:g} q: it cannot be written as a URDF",
+            )
         child = _link_name(chain, k, element.joint, main)
         link = ET.SubElement(root, "link", name=child)
         if main and chain.inertias is not None and chain.inertias[element.joint].any():
@@ -332,7 +335,7 @@ def _matching_path(tree: UrdfTree, nominal: Chain) -> list[JointTag]:
         refuse_robot(
             tree.where,
             f"its joints to '{tip}' are {', '.join(actuated)}; the nominal robot '{nominal.name}' has "
-            f"{', '.join(names)}: not the same arm",
+            f"{', '.join(names)}: give the URDF of the nominal robot",
         )
     return path[path.index(moving[0]) :]
 

@@ -179,7 +179,7 @@ def test_failing_recording_stops_nothing(fitted, monkeypatch):
 
 def test_empty_folders_are_refused(tmp_path):
     """Folders that show nothing are refused."""
-    with pytest.raises(UsageError, match="holds no result; give a folder with measured poses"):
+    with pytest.raises(UsageError, match="contains no result; give a folder with measured poses"):
         viewing.read(tmp_path)
     with pytest.raises(UsageError, match="neither folder nor CSV"):
         viewing.read(tmp_path / "none")

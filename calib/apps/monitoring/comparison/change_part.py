@@ -47,7 +47,7 @@ class ChangePart(ABC):
     @property
     @abstractmethod
     def today(self) -> float:
-        """The robot's error today if it used the earlier parameters, in the unit of the tolerance."""
+        """The robot's error if it still used the earlier parameters today, in the unit of the tolerance."""
 
     @property
     @abstractmethod
@@ -71,7 +71,7 @@ class ChangePart(ABC):
 
     @abstractmethod
     def shown(self, value: float) -> str:
-        """Return an error as text with its unit."""
+        """Return `value`, an error in the unit of the tolerance, as text with its unit."""
 
     @abstractmethod
     def numbers(self) -> dict[str, object]:
@@ -120,7 +120,7 @@ class ChangePart(ABC):
         reached = met(self.today, self.tolerance or 0.0)
         figure = KeyFigure(self.error_words, "", self.shown(self.today), "", self.basis, allowed, reached)
 
-        title = "Changed parameters, those first that explain most"
+        title = "Changed parameters, in the order of how much of the change they explain"
         compared = [parameter for parameter in self.change.parameters if parameter.sigma or parameter.explained]
         parameters = table(title, _PARAMETERS, compared[:MAX_PARAMETERS], f"All in {self.table}.")
         blocks = [*self.blocks(), parameters]

@@ -40,7 +40,7 @@ class ParameterChange(NamedTuple):
         sigma: σ of the difference, from both covariances; 0 where neither estimate fitted the parameter.
         alone, alone_sigma: estimated change of the parameter if no other parameter changed, and its σ; NaN where the
             data do not identify it.
-        explained: decrease of χ² by that change.
+        explained: decrease, by that change, of the χ² statistic of the hypothesis that nothing changed.
     """
 
     name: str
@@ -60,7 +60,7 @@ class ChangeTest:
     Attributes:
         chi2, freedom: χ² of the hypothesis that nothing changed, and its degrees of freedom.
         parameters: changes of the parameters, in descending order of the decrease of χ².
-        extra: number of combinations that only the earlier estimate has, and that only the later one has.
+        extra: number of parameter combinations that only the earlier estimate has, and that only the later one has.
     """
 
     chi2: float
@@ -72,8 +72,9 @@ class ChangeTest:
     def probability(self) -> float:
         """p value of the hypothesis that nothing changed.
 
-        It is twice the smaller of two p values (Bonferroni): of χ², and of the largest decrease of χ² by one parameter.
-        1 where no estimated combination could have changed.
+        It is twice the smaller of two p values (Bonferroni). The first is that of the χ² statistic of the difference
+        between both estimates, the second that of the largest decrease of χ² by a change of one parameter. 1 where no
+        estimated combination of parameters could have changed.
         """
         if self.freedom == 0:
             return 1.0
@@ -95,7 +96,7 @@ class ChangeTest:
 
     @property
     def unexplained(self) -> float:
-        """Remaining χ² if only the first of `parameters` changed."""
+        """The χ² statistic of the remaining difference if only the first of `parameters` changed."""
         if not self.parameters:
             return self.chi2
         return max(self.chi2 - self.parameters[0].explained, 0.0)
@@ -107,12 +108,20 @@ class ChangeTest:
 
     @property
     def rivals(self) -> tuple[str, ...]:
-        """Names of further parameters whose change alone would explain the difference about as well as the first's."""
+        """Names of further parameters whose change alone would explain the difference nearly as well as the first's.
+
+        Their decrease of the χ² statistic is less than `AS_WELL` below that of the first of `parameters`.
+        """
         best = self.parameters[0].explained
         return tuple(parameter.name for parameter in self.parameters[1:] if parameter.explained > best - AS_WELL)
 
     def suffices(self, explained: float, count: int) -> bool:
-        """Return whether the remaining χ² may be chance after `count` parameters lowered it by `explained`."""
+        """Return whether the remaining difference between both estimates may be chance.
+
+        Args:
+            explained: decrease of the χ² statistic by changes of some parameters.
+            count: number of these parameters.
+        """
         residual = max(self.chi2 - explained, 0.0)
         freedom = max(self.freedom - count, 1)
         return bool(chi2.sf(residual, freedom) > CHANCE)
@@ -137,9 +146,11 @@ class Tested:
         return float(self.difference @ self.difference)
 
     def alone(self, k: int, identifiable: bool = True) -> tuple[float, float, float]:
-        """Return change, σ and decrease of χ² of parameter k if only this parameter changed.
+        """Return change, σ and decrease of the χ² statistic of a parameter if only this parameter changed.
 
-        NaN, NaN, 0 if the parameter is not `identifiable`.
+        Args:
+            k: index (from 0) of the parameter among the p parameters.
+            identifiable: whether the parameter is identifiable; if not, NaN, NaN and 0 are returned.
         """
         size = float(np.linalg.norm(self.columns[:, k]))
         if not identifiable or not size:
@@ -148,9 +159,13 @@ class Tested:
         return along / size**2, 1.0 / size, (along / size) ** 2
 
     def together(self, chosen: np.ndarray) -> tuple[np.ndarray, float, int]:
-        """Return the changes (p,) of the `chosen` parameters that lower χ² most together, the decrease, and their rank.
+        """Return the changes of several parameters that lower the χ² statistic most together.
 
-        Changes of all other parameters are 0.
+        Args:
+            chosen: indices of the parameters that may have changed; the change of all others is 0.
+
+        Returns:
+            The changes (p,), the decrease of χ², and the rank of the chosen parameters' derivatives.
         """
         columns = self.columns[:, chosen]
         size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
@@ -199,10 +214,10 @@ def tested(
 
 
 def span(columns: np.ndarray) -> np.ndarray:
-    """Return an orthonormal basis (k, r) of the column space of a matrix (k, any).
+    """Return an orthonormal basis (k, r) of the column space of a matrix of rank r.
 
     Args:
-        columns: the matrix, with columns of norm near 1 or zero.
+        columns: the matrix (k, any), with columns of norm near 1 or zero.
     """
     basis, size, _ = np.linalg.svd(columns, full_matrices=False)
     return basis[:, size > SPAN]

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.apps.monitoring.comparison.calibrations import Calibration
 from calib.apps.monitoring.comparison.change_test import ChangeTest, ParameterChange, Tested, span, tested
+from calib.apps.monitoring.comparison.geometry_calibration import Calibration
 from calib.apps.monitoring.settings import DiffSettings
 from calib.errors import UsageError, require
 from calib.toolkit.chains import evaluate, random_joints
@@ -90,7 +90,7 @@ class _Seen:
         """Return the motion of the target at these poses.
 
         Args:
-            where: description of the poses.
+            where: description of the poses, such as "at random poses".
             covariance: (p, p) covariance of the parameters' change, from which the expected motion is computed.
         """
         motions = self.change.reshape(2, 3, -1)
@@ -100,7 +100,11 @@ class _Seen:
         return ToolMotion(where, self.q, self.points, distances, turns, expected)
 
     def size(self, steps: np.ndarray) -> float:
-        """Return the rms motion [m] of the target under independent steps (k, p) of the parameters."""
+        """Return the rms motion [m] of the target if the parameters change by independent steps.
+
+        Args:
+            steps: (k, p) steps of the p parameters.
+        """
         displacements = (steps @ self.rows).reshape(len(steps), 6, len(self.q))[:, :3]
         return float(np.sqrt(np.sum(displacements**2) / len(self.q)))
 
@@ -154,6 +158,10 @@ class _Pair:
 def compare(before: Calibration, after: Calibration, settings: DiffSettings) -> GeometryChange:
     """Return the change of the geometry between two calibrations.
 
+    Args:
+        before, after: the earlier and the later calibration.
+        settings: whether changes of base and tool placement count, and the seed of random poses.
+
     Raises:
         UsageError: base or tool are to count, but one calibration does not have them.
     """
@@ -198,7 +206,12 @@ def compare(before: Calibration, after: Calibration, settings: DiffSettings) -> 
 
 
 def corrected_motion(before: Calibration, after: Calibration, settings: DiffSettings) -> float:
-    """Return the rms motion [m] of the target at the poses of the later fit, with the joint corrections of both."""
+    """Return the rms motion [m] of the target at the poses of the later fit, joint corrections of both included.
+
+    Args:
+        before, after: the earlier and the later calibration.
+        settings: whether changes of base and tool placement count.
+    """
     pair = _pair(before, after, settings)
     earlier, later = pair.cells
     cells = (
@@ -215,7 +228,11 @@ def corrected_motion(before: Calibration, after: Calibration, settings: DiffSett
 
 
 def frame_changes(before: Calibration, after: Calibration) -> dict[str, np.ndarray]:
-    """Return the motions (6,) [m, rad] of ``base`` and ``tool`` between two fits; empty for a nominal robot."""
+    """Return the motions (6,) [m, rad] of ``base`` and ``tool`` between two fits; empty for a nominal robot.
+
+    Args:
+        before, after: the earlier and the later calibration.
+    """
     if before.nominal or after.nominal:
         return {}
     station_before, station_after = _compared(before.cell.station_names, after.cell.station_names)
@@ -227,13 +244,21 @@ def frame_changes(before: Calibration, after: Calibration) -> dict[str, np.ndarr
 
 
 def _step(T_first: np.ndarray, T_second: np.ndarray) -> np.ndarray:
-    """Return the motion (6,) [m, rad] from the first placement to the second, in the frame of the first."""
+    """Return the motion (6,) [m, rad] from the first placement to the second, in the frame of the first.
+
+    Args:
+        T_first, T_second: (4, 4) the two placements.
+    """
     step = invert(T_first) @ T_second
     return np.concatenate([step[:3, 3], rotation_vector(step[:3, :3])])
 
 
 def _compared(names_before: Sequence[str], names_after: Sequence[str]) -> tuple[int, int]:
-    """Return the indices of the two stations (or tools) to compare: those with a common name, else 0 and 0."""
+    """Return the indices (from 0) of the two stations, or tools, to compare: those with a common name, else 0 and 0.
+
+    Args:
+        names_before, names_after: names of the stations or tools in the earlier and in the later calibration.
+    """
     for name in names_before:
         if name in names_after:
             return names_before.index(name), names_after.index(name)

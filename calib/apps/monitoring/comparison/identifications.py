@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calib import folders
-from calib.apps.monitoring.comparison.places import Place, check_same_robot
+from calib.apps.monitoring.comparison.calibration_sources import Place, check_same_robot
 from calib.errors import UsageError, require
 from calib.toolkit.chains import CalibratedChain, read_calibrated
 from calib.toolkit.pose_data import read_table
@@ -98,6 +98,9 @@ class Identified:
 def read_models(before: Place, after: Place) -> tuple[Identified, Identified]:
     """Return two identified models of one robot, each read from its folder.
 
+    Args:
+        before, after: sources of the earlier and of the later model.
+
     Raises:
         UsageError: the torques are of different kinds or units.
         RobotError: the models are of different robots.
@@ -167,6 +170,10 @@ def read_states(path: Path, joints: int) -> MotionStates | None:
     """Return the states of a motion from a table; None if the table lacks positions, velocities or accelerations.
 
     Columns ``measured_…`` are the torques, if there are any.
+
+    Args:
+        path: CSV file with columns ``q_…``, ``v_…``, ``a_…``.
+        joints: number of joints.
 
     Raises:
         UsageError: a number of joints other than `joints`.

@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from calib.apps.monitoring import pages
+from calib.apps.monitoring import report_folder
 from calib.apps.monitoring.comparison import geometry_change, torque_change
-from calib.apps.monitoring.comparison.calibrations import read_fits
+from calib.apps.monitoring.comparison.calibration_sources import Place, place_of
 from calib.apps.monitoring.comparison.change_part import ChangePart
 from calib.apps.monitoring.comparison.change_test import ParameterChange
+from calib.apps.monitoring.comparison.geometry_calibration import read_fits
 from calib.apps.monitoring.comparison.geometry_change import GeometryChange
 from calib.apps.monitoring.comparison.identifications import read_models, read_states
-from calib.apps.monitoring.comparison.places import Place, place_of
 from calib.apps.monitoring.comparison.tool_part import ToolPart
 from calib.apps.monitoring.comparison.torque_change import DynamicsChange
 from calib.apps.monitoring.comparison.torque_part import TorquePart
@@ -109,6 +109,10 @@ class RobotChange(ChartedResult, ReportedResult):
         """Write the comparison into a folder and return its path.
 
         The folder contains report.html, tables of all parameters, metrics.json, and the figures as PNG.
+
+        Args:
+            out: the folder.
+            plots: whether figures are drawn.
         """
         parts = []
         for part in self.parts:
@@ -116,10 +120,10 @@ class RobotChange(ChartedResult, ReportedResult):
             if plots:
                 charts = part.charts()
             parameters = (part.table, ParameterChange._fields, part.change.parameters)
-            parts.append(pages.ResultPart(part.section(), charts, part.captions, parameters))
+            parts.append(report_folder.ResultPart(part.section(), charts, part.captions, parameters))
         earlier, later, robot = self._names
         setup = {"earlier": earlier, "later": later}
-        return pages.save(Path(out), "comparison", f"Change of {robot}", setup, parts, self.to_dict(), TABLES)
+        return report_folder.save(Path(out), "comparison", f"Change of {robot}", setup, parts, self.to_dict(), TABLES)
 
     @property
     def _names(self) -> tuple[str, str, str]:
@@ -154,7 +158,8 @@ def diff(before: Compared, after: Compared, settings: DiffSettings = DEFAULT_DIF
         before, after: fits, identifications, their folders, or folders of sessions. Geometry and dynamics are compared
             where both calibrations contain them. One of the two may be the nominal robot (file or name), for a
             comparison of geometry with a fit.
-        settings: tolerances, whether changes of base and tool placement count, further motions.
+        settings: tolerances, whether changes of base and tool placement count, and files of motions along which the
+            change of the torque is computed.
 
     Returns:
         ``verdict``, ``geometry`` with the test and the tool's motion, ``dynamics`` with the test and the change of the
@@ -197,7 +202,7 @@ def _torque_parts(before: Place, after: Place, settings: DiffSettings) -> list[C
         states = read_states(Path(name), later.model.n)
         require(states, f"{name}: no accelerations; expected columns q_…, v_… and a_…", UsageError)
         motions[name] = states  # type: ignore[assignment]
-    message = f"neither {earlier.name} nor {later.name} holds a motion without payload; give one with --motion"
+    message = f"neither {earlier.name} nor {later.name} contains a motion without payload; give one with --motion"
     require(motions, message, UsageError)
     change = torque_change.compare(earlier, later, motions)
     tolerance = settings.torque_tolerance or later.tolerance or earlier.tolerance or None

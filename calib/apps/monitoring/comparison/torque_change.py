@@ -56,8 +56,8 @@ class PartChange:
 
     Attributes:
         name: name of the part.
-        explained: decrease of χ² if only this part changed.
-        count: number of combinations that the part changes.
+        explained: decrease of the χ² statistic of the difference between the models, if only this part changed.
+        count: number of parameter combinations that the part changes.
         rms: rms change of the torque along the first motion if only this part changed [N m or N].
     """
 
@@ -92,7 +92,12 @@ class DynamicsChange(ChangeTest):
 
 
 def compare(before: Identified, after: Identified, motions: dict[str, MotionStates]) -> DynamicsChange:
-    """Return the change between two models of one robot, with the change of the torque along the given motions."""
+    """Return the change between two models of one robot, with the change of the torque along the given motions.
+
+    Args:
+        before, after: the earlier and the later model.
+        motions: states by the name of the motion.
+    """
     keys = list(dict.fromkeys([*before.keys, *after.keys]))
     values_before, covariance_before = _among(before, keys)
     values_after, covariance_after = _among(after, keys)
@@ -126,9 +131,13 @@ def compare(before: Identified, after: Identified, motions: dict[str, MotionStat
 
 
 def _among(model: Identified, keys: list[Hashable]) -> tuple[np.ndarray, np.ndarray]:
-    """Return values (s,) and covariance (s, s) of a model's parameters in the order of `keys`.
+    """Return values (s,) and covariance (s, s) of a model's base parameters in the order of `keys`.
 
     Both are zero for parameters that the model does not have.
+
+    Args:
+        model: the model.
+        keys: keys of s base parameters, as in `Identified.keys`.
     """
     indices = [keys.index(key) for key in model.keys]
     values = np.zeros(len(keys))
@@ -175,7 +184,7 @@ def _distinct(columns: np.ndarray, first: int) -> list[int]:
     """Return the indices of columns of a matrix (s, p) that are not parallel to an earlier column.
 
     Args:
-        columns: the matrix.
+        columns: the matrix, whose columns are derivatives by p parameters.
         first: number of columns at the beginning that are always included.
     """
     size = np.linalg.norm(columns, axis=0)
@@ -191,7 +200,7 @@ def _parts(test: Tested, arm: IdentificationModel, names: list[str], states: Mot
     """Return each joint's friction and each link's inertial parameters with the decrease of χ² if only they changed.
 
     Args:
-        test: the test.
+        test: test of the tested combinations of parameters.
         arm: the model whose parameters are grouped.
         names: names of the tested parameters.
         states: motion along which the change of the torque is computed.
@@ -213,7 +222,7 @@ def _parts(test: Tested, arm: IdentificationModel, names: list[str], states: Mot
 
 
 def _frictions(model: IdentificationModel) -> dict[str, set[str]]:
-    """Return the names of the friction terms of each joint, by the text "the friction of joint …"."""
+    """Return the names of the friction terms of each joint in a model, by the text "the friction of joint …"."""
     frictions: dict[str, set[str]] = {f"the friction of joint {j + 1}": set() for j in range(model.n)}
     for term in model.columns:
         part = f"the friction of joint {term.acts[0][0] + 1}"
@@ -223,7 +232,7 @@ def _frictions(model: IdentificationModel) -> dict[str, set[str]]:
 
 
 def _links(model: IdentificationModel) -> dict[str, set[str]]:
-    """Return the names of the ten inertial parameters of each link, by the text "the body of link …"."""
+    """Return the names of each link's ten inertial parameters in a model, by the text "the body of link …"."""
     names = model.names[: model.inertial]
     return {f"the body of link {k // 10 + 1}": set(names[k : k + 10]) for k in range(0, len(names), 10)}
 

@@ -65,7 +65,7 @@ class TorquePart(ChangePart):
     @property
     def words(self) -> str:
         change = self.judged
-        expected = f"σ lets expect {_rms(change.expected):.2g} {self.unit}"
+        expected = f"expected from σ: {_rms(change.expected):.2g} {self.unit}"
         return f"the torque changed by {change.rms:.3g} {self.unit} rms ({expected})"
 
     @property
@@ -131,7 +131,7 @@ class TorquePart(ChangePart):
             RecordColumn("motion", "{0.motion}", number=False),
             RecordColumn("torque of", "{0.name}", number=False),
             RecordColumn(f"change rms {unit}", "{0.change:.3g}"),
-            RecordColumn("σ of that", "{0.expected:.2g}"),
+            RecordColumn("expected from σ", "{0.expected:.2g}"),
             RecordColumn("worst", "{0.worst:.3g}"),
             RecordColumn("torque rms", "{0.torque:.3g}"),
         ]
@@ -144,14 +144,14 @@ class TorquePart(ChangePart):
         return [
             Text("Torque", [self._words(change) for change in self.change.torques]),
             table("Change of the torque", torques, rows),
-            table("What one joint's friction or one link's body explains", parts, self.change.parts, most=6),
+            table("Change that one joint's friction or one link's body explains", parts, self.change.parts, most=6),
         ]
 
     def _words(self, change: TorqueChange) -> str:
         text = f"{change.where}: the torque changed by {change.rms:.3g} {self.unit} rms"
         if change.unexplained:
             earlier, later = change.unexplained
-            text += f"; the earlier model leaves {earlier:.3g} % of it unexplained, the later one {later:.3g} %"
+            text += f"; the earlier model leaves {earlier:.3g} % of the torque unexplained, the later one {later:.3g} %"
         return text
 
     def charts(self) -> dict[str, Chart]:
@@ -184,7 +184,11 @@ class TorquePart(ChangePart):
 
 
 def _unexplained_before(change: TorqueChange) -> float:
-    """Return the share of the torque [%] that the earlier model leaves unexplained; 0 where no torque was measured."""
+    """Return the share of the torque [%] that the earlier model leaves unexplained; 0 where no torque was measured.
+
+    Args:
+        change: change of the torque along one motion.
+    """
     if change.unexplained is None:
         return 0.0
     return change.unexplained[0]

@@ -57,7 +57,12 @@ def stage(report: DynamicReport, section: Section, plots: bool, tolerance: float
 
 
 def _unchecked(report: DynamicReport, tolerance: float) -> Iterator[str]:
-    """Yield texts on the properties that the recordings of an identification cannot prove."""
+    """Yield texts on the properties that the recordings of an identification cannot prove.
+
+    Args:
+        report: stored results of the identification.
+        tolerance: largest acceptable torque error [%]; 0: no tolerance.
+    """
     if not report.unseen.proofs:
         yield "torque errors on unseen motion: none was recorded"
     if not tolerance:
@@ -69,9 +74,12 @@ def _uncertainty_findings(report: DynamicReport) -> list[str]:
 
 
 def _worst_first(report: DynamicReport) -> np.ndarray:
-    """Return the indices of the torque rows, sorted by error, largest first.
+    """Return the indices (from 0) of the torque rows, sorted by error, largest first.
 
     Errors are divided by the torque limits if all limits are known.
+
+    Args:
+        report: stored results of the identification.
     """
     _, proof, _ = proof_of(report.unseen)
     errors = np.nan_to_num(proof.raw.rms)
@@ -104,7 +112,12 @@ def _torque_table(report: DynamicReport, order: np.ndarray) -> ReportTable:
 
 
 def _curves(report: DynamicReport, order: np.ndarray) -> Iterator[Picture]:
-    """Yield a picture of the torques with the largest errors, measured and predicted; nothing without curves."""
+    """Yield a picture of the torques with the largest errors, measured and predicted; nothing without curves.
+
+    Args:
+        report: stored results of the identification.
+        order: indices of the torque rows, the row with the largest error first.
+    """
     from calib.procedure.report.charts import vector
     from calib.procedure.report.dynamics_figures import torques
 
@@ -176,7 +189,12 @@ class _DesignMetrics:
 
 
 def trained_on(folder: Path, joints: Sequence[Joint]) -> Captioned:
-    """Return a chart of the designed training motion in a folder, and a caption that states its condition number."""
+    """Return a chart of the designed training motion in a folder, and a caption that states its condition number.
+
+    Args:
+        folder: folder of the designed motion.
+        joints: the robot's joints.
+    """
     from calib.procedure.report.motion_figures import motion_sheet
 
     motion = coefficients.read(folder)

@@ -64,7 +64,11 @@ def _blocks(report: Report, plots: bool) -> Iterator[Block]:
 
 
 def _unchecked(report: Report) -> Iterator[str]:
-    """Yield texts on the properties that the measurements of a fit cannot prove."""
+    """Yield texts on the properties that the measurements of a fit cannot prove.
+
+    Args:
+        report: stored results of the fit.
+    """
     metrics = report.metrics
     if not metrics.proofs:
         yield "errors on held-out poses: none were measured"
@@ -79,7 +83,13 @@ def _uncertainty_findings(metrics: FitMetrics) -> list[str]:
 
 
 def _figures(report: Report, row_errors: RowErrors, label: str) -> Iterator[Picture]:
-    """Yield histograms of nominal and calibrated errors, and a map of calibrated errors that marks the worst pose."""
+    """Yield histograms of nominal and calibrated errors, and a map of calibrated errors that marks the worst pose.
+
+    Args:
+        report: stored results of the fit.
+        row_errors: errors on the rows to show.
+        label: text that names these rows in captions.
+    """
     from calib.procedure.report.charts import text, vector
     from calib.procedure.report.geometry_figures import error_histogram, error_map
     from calib.procedure.report.style import MARK
@@ -111,7 +121,12 @@ def _figures(report: Report, row_errors: RowErrors, label: str) -> Iterator[Pict
 
 
 def _worst(report: Report, row_errors: RowErrors) -> Iterator[str]:
-    """Yield sentences on the pose with the largest error: its errors, joint values, and target position."""
+    """Yield sentences on the pose with the largest error: its errors, joint values, and target position.
+
+    Args:
+        report: stored results of the fit.
+        row_errors: errors on the rows to show.
+    """
     rows = row_errors.worst or row_errors
     deliverable = report.metrics.deliverable
     nature = next(iter(rows.nominal))

@@ -67,7 +67,7 @@ NOTES = (Text("Limitations", LIMITATIONS), Text("Conventions", CONVENTIONS))
 
 @dataclass(frozen=True)
 class Entry:
-    """A line of a certificate: label and value; an empty value is a blank line to fill in by hand."""
+    """A line of a certificate: label and value; an empty value is a blank line to be filled in by hand."""
 
     label: str
     value: str = ""
@@ -152,7 +152,7 @@ def records(
         setup: robot, instrument and method; the certificate contains only the entries of `CERTIFIED_SETUP`.
         stages: contents on the stages.
         unchecked: texts on unproven properties in addition to those of the stages.
-        files: input files, see `calib.procedure.report.fit_report.file_row`; the most important ones first.
+        files: input files (name, role, size in bytes, SHA-256), the most important ones first.
         details: entries made by a person.
         alert: warning at the top; empty: no warning.
     """
@@ -196,7 +196,12 @@ def records(
 
 
 def _certificate_page(title: str, blocks: Sequence[Block]) -> Section:
-    """Return a page of a certificate, with texts shortened to the allowed number of letters."""
+    """Return a page of a certificate, with texts shortened to the allowed number of letters.
+
+    Args:
+        title: title of the page.
+        blocks: its content.
+    """
     return Section(title, [_cut(block) if isinstance(block, Text) else block for block in blocks])
 
 
@@ -214,7 +219,11 @@ def judgement(section: Section, max_letters: int | None = None) -> Judgement:
 
 
 def key_table(sections: Sequence[Section]) -> ReportTable:
-    """Return the table of key figures: nominal value, calibrated value, requested tolerance, and whether it is met."""
+    """Return the table of key figures: nominal value, calibrated value, requested tolerance, and whether it is met.
+
+    Args:
+        sections: sections of the report, with key figures.
+    """
     header = ("quantity", "nominal", "after", "standard error", "on", "tolerance asked", "met")
     rows, with_tolerance = [], set()
     for section in sections:
@@ -233,7 +242,7 @@ def _cells(figure: KeyFigure) -> tuple[str, ...]:
 
 
 def _cut(block: Text) -> Text:
-    """Return a text of a certificate shortened to `MAX_LINES` sentences of at most `MAX_LINE` letters."""
+    """Return the text `block` of a certificate shortened to `MAX_LINES` sentences of at most `MAX_LINE` letters."""
     lines = [shortened(_local(str(line)), MAX_LINE) for line in block.lines]
     if len(lines) > MAX_LINES:
         count = len(lines) - MAX_LINES + 1
@@ -270,7 +279,14 @@ def files_table(files: Sequence[FileRow], max_files: int | None = None) -> Repor
 def report(
     title: str, subtitle: str, setup: Sequence[Entry], sections: Sequence[Section], files: Sequence[FileRow] = ()
 ) -> Page:
-    """Return the record of a report: verdicts, all sections, setup, files, limitations and conventions."""
+    """Return the record of a report: verdicts, all sections, setup, files, limitations and conventions.
+
+    Args:
+        title, subtitle: title and subtitle of the report.
+        setup: robot, instrument and method.
+        sections: sections on the stages.
+        files: input files; empty: no list of files.
+    """
     verdicts = [judgement(section) for section in sections if section.verdict]
     reasons = [f"{verdict.title}: {verdict.label}. {verdict.reason}" for verdict in verdicts]
     report_sections = [Section("Result", [Text("Verdict", reasons), key_table(sections)]), *sections]

@@ -39,7 +39,12 @@ def write(folder: Path, certificate: Certificate, report: Page) -> list[str]:
 
 
 def write_figures(folder: Path, page: Page) -> int:
-    """Write the figures of a report as SVG into a folder, numbered by section; return the number of figures."""
+    """Write the figures of a report as SVG into a folder, numbered by section; return the number of figures.
+
+    Args:
+        folder: the folder.
+        page: the report.
+    """
     from calib.procedure.report.charts import vector
 
     count = 0
@@ -56,7 +61,7 @@ def write_figures(folder: Path, page: Page) -> int:
 
 
 def html(page: Page) -> str:
-    """Return a certificate or report as HTML."""
+    """Return a certificate or report (`page`) as HTML."""
     template = "sheet.html" if isinstance(page, Certificate) else "report.html"
     return filled(PACKAGE, template, page=page)
 
@@ -93,12 +98,17 @@ def _first_user() -> int:
 
 
 def pages(document: bytes) -> int:
-    """Return the number of pages of a PDF written by Typst."""
+    """Return the number of pages of a PDF (`document`, the file's content) written by Typst."""
     return len(re.findall(rb"/Type\s*/Page\b", document))
 
 
 def _typeset(inputs: Mapping[str, bytes], dense: bool) -> tuple[bytes, list[str]]:
-    """Return the PDF made from the given files (template and contents), and a note on letters that no font has."""
+    """Return the PDF that Typst makes, and a note on letters that no font has.
+
+    Args:
+        inputs: file name -> content, of the template and the texts.
+        dense: whether smaller type is used.
+    """
     import typst  # 80 MB, and needed for nothing else
 
     notes: list[str] = []
@@ -115,7 +125,7 @@ def _typeset(inputs: Mapping[str, bytes], dense: bool) -> tuple[bytes, list[str]
             lacking = re.search('the text `"(.*)"` could not be displayed', str(error))
             if lacking is None or not standard:
                 raise
-            notes = [f"{PAGES[1]}: no font here has {lacking[1]!r}: a box stands for it; {PAGES[0]} shows it"]
+            notes = [f"{PAGES[1]}: no font here has {lacking[1]!r}: a box replaces it; {PAGES[0]} shows it"]
     raise AssertionError("without a standard every letter is accepted")
 
 

@@ -103,6 +103,9 @@ def measured_range(metrics: FitMetrics) -> str:
     """Return a text on the measured range of each joint, in which the verdict is valid.
 
     Empty for fits of earlier versions.
+
+    Args:
+        metrics: metrics of the fit.
     """
     joint_range = None if metrics.findings is None else metrics.findings.joint_range
     if joint_range is None:

@@ -24,7 +24,10 @@ class StoredMotion(Viewed):
     """Folder of a designed or planned motion."""
 
     def motion(self) -> Path:
-        """Return the path of the file to play: the whole run with approach if there is one, otherwise the motion."""
+        """Return the path of the motion's file to play.
+
+        It contains the whole run with the approach if the folder has such a file, otherwise only the motion.
+        """
         for name in (RUN, PLANNED, SAMPLES):
             path = self.path / name
             if path.is_file():
@@ -44,7 +47,9 @@ class StoredFile(StoredResult):
         return {self.path.stem: read_table(self.path)} if self.path.suffix == ".csv" else {}
 
     def save(self, out: str | Path, *, plots: bool = True) -> Path:
-        """Copy the file and its accompanying files, which are renamed accordingly, and return the path of the copy.
+        """Copy the file and the files that accompany it, and return the path of the copy.
+
+        Accompanying files are renamed after the copy.
 
         Args:
             out: path of the copy.
@@ -111,7 +116,7 @@ def open_result(path: str | Path, verb: str = "result") -> StoredResult:
 
     Args:
         path: folder or file that a command wrote, or a session.
-        verb: name of the command that opens the result, for the message (`calib.result_kinds.TAKES`).
+        verb: name of the command that opens the result (a key of `calib.result_kinds.TAKES`), for the error message.
 
     Raises:
         UsageError: if there is no result at this path.

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from calib.apps.monitoring.comparison.places import Place, check_same_robot
+from calib.apps.monitoring.comparison.calibration_sources import Place, check_same_robot
 from calib.toolkit.chains import CalibratedChain, Chain, Deflection, load_calibrated, read_calibrated
 from calib.toolkit.installations import Installation, layout, read_installation
 from calib.toolkit.result_folders import ComparedRows, FitMetrics, read_covariance
@@ -90,6 +90,9 @@ class Calibration:
 def read_fits(before: Place, after: Place) -> tuple[Calibration, Calibration]:
     """Return two calibrations of one robot, read from their folders; one of the two may be nominal.
 
+    Args:
+        before, after: sources of the earlier and of the later calibration.
+
     Raises:
         RobotError: the calibrations are of different robots.
     """
@@ -108,7 +111,11 @@ def read_fits(before: Place, after: Place) -> tuple[Calibration, Calibration]:
 
 
 def read_fit(source: Place) -> Calibration:
-    """Return the calibration in the folder of a fit or of a session."""
+    """Return the calibration in the folder of a fit or of a session.
+
+    Args:
+        source: the folder; its fit must exist.
+    """
     folder = source.fit
     assert folder is not None
     metrics = folder.metrics()
@@ -151,7 +158,7 @@ def _nominal(name: str, like: Chain) -> Calibration:
 
     Args:
         name: file or name of the robot.
-        like: chain whose base and tip links are taken.
+        like: chain of the other calibration, whose base and tip links are used for this robot, too.
     """
     base = tip = None
     if name.endswith(".urdf"):

@@ -30,12 +30,16 @@ def motion_file(path: Path) -> Path:
 
 
 def is_motion(path: Path) -> bool:
-    """Return whether a CSV file contains a motion, recognised by a column t."""
+    """Return whether the CSV file `path` contains a motion, recognised by a column t."""
     return "t" in read_header(path)[0]
 
 
 def setpoints(path: Path, controller: Controller) -> tuple[np.ndarray, list[str]]:
     """Return the setpoints (k, n) [rad] of a motion, interpolated at a controller's cycle, and the joints' names.
+
+    Args:
+        path: CSV file of the motion.
+        controller: the controller.
 
     Raises:
         UsageError: a controller that cannot stream setpoints, or a file without joint positions.

@@ -78,7 +78,7 @@ def prepared(jacobians: ArrayLike, m: int, existing: ArrayLike | None = None) ->
     if existing is not None:
         before = checked(existing, "existing")
     if before.shape[2] != p:
-        raise BadInput(f"existing: {before.shape[2]} parameters, the candidates have {p}")
+        raise BadInput(f"existing: {before.shape[2]} parameters, but the candidates have {p}: use the same columns")
     measured_rows = before.shape[0] * before.shape[1]
     _check_counts(count, rows, p, m, measured_rows)
     stacked = array.reshape(-1, p)

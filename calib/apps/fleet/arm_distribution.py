@@ -105,11 +105,12 @@ def spread(robots: Sequence[CalibratedChain]) -> tuple[ParameterSpread, ...]:
 def _most_probable(
     data: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]], family: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean μ (k,) and standard deviation τ (k,) over the arms by expectation maximisation.
+    """Return mean μ (k,) and standard deviation τ (k,) of k parameters over the arms, by expectation maximisation.
 
     Args:
-        data: for each arm, whether each parameter was fitted (k,), and C⁻¹ and C⁻¹ x̂ of its fit.
-        family: (k,) number of each parameter's family.
+        data: for each arm, whether each parameter was fitted (k,), and of the f fitted ones the inverse C⁻¹ (f, f) of
+            the covariance, and C⁻¹ x̂ (f,) with the fitted deviations x̂ from nominal.
+        family: (k,) number of each parameter's family (joint offsets, other angles, lengths).
     """
     mean = np.zeros(len(family))
     variance = np.full(len(family), FIRST_VARIANCE)
@@ -154,6 +155,11 @@ def write(folder: Path, robots: Sequence[CalibratedChain], parameters: Sequence[
     """Write the prior for `calib fit` into a folder, and return its path.
 
     ``robot.toml`` is the expected arm; the options file contains the prior's standard deviations.
+
+    Args:
+        folder: the folder.
+        robots: calibrated arms with one nominal description.
+        parameters: distribution of each fitted parameter over these arms.
     """
     folder.mkdir(parents=True, exist_ok=True)
     write_calibrated(folder, expected_arm(robots, parameters), comment=f"mean of {len(robots)} arms")

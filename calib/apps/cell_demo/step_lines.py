@@ -32,7 +32,13 @@ SECONDS = {
 
 
 def row(name: str, number: float, meaning: str) -> str:
-    """Return a line of the summary: name, number with three significant digits, and what the number means."""
+    """Return a line of the summary.
+
+    Args:
+        name: name of the number.
+        number: the number, which is printed with three significant digits.
+        meaning: unit of the number and what it means.
+    """
     return f"{name:<11} {number:>6.3g} {meaning}"
 
 
@@ -128,7 +134,10 @@ class Telling:
 
 
 def reasons(session: Session) -> Iterator[str]:
-    """Yield a line for each verdict other than pass: its meaning, and the commands that explain its reasons."""
+    """Yield a line for each verdict of a session other than pass.
+
+    The line states what the verdict means, and the commands that explain its reasons.
+    """
     reports: dict[str, ValidationMetrics | UnseenReport] = {"geometry": session.validation.metrics()}
     if session.dynamic:
         reports["dynamics"] = session.identification.unseen.read()
@@ -141,7 +150,7 @@ def reasons(session: Session) -> Iterator[str]:
 
 
 def paths(session: Session) -> list[str]:
-    """Return lines with the paths of up to five result files, those that exist, most important first."""
+    """Return lines with the paths of up to five existing result files of a session, most important first."""
     candidates = {
         "session": SETTINGS,
         "certificate": CERTIFICATE,

@@ -53,8 +53,8 @@ class Place:
         if self.identification:
             contents.append("dynamics")
         if self.session and not contents:
-            return f"{self.name} holds no result yet ({command_line('next', self.name)})"
-        return f"{self.name} holds {' and '.join(contents) or 'the nominal robot'}"
+            return f"{self.name} has no result yet ({command_line('next', self.name)})"
+        return f"{self.name} contains {' and '.join(contents) or 'the nominal robot'}"
 
 
 def place_of(source: str | Path, verb: str = "diff") -> Place:

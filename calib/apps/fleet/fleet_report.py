@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from calib import files, folders
-from calib.apps.fleet import prior
-from calib.apps.fleet.prior import ParameterSpread
+from calib.apps.fleet import arm_distribution
+from calib.apps.fleet.arm_distribution import ParameterSpread
 from calib.apps.fleet.tools import MIN_ARMS, MIN_TIMES, ToolUse, tools
 from calib.apps.fleet.visits import visits
-from calib.apps.monitoring.comparison.calibrations import Calibration
+from calib.apps.monitoring.comparison.calibration_sources import check_same_robot
+from calib.apps.monitoring.comparison.geometry_calibration import Calibration
 from calib.apps.monitoring.comparison.geometry_change import ToolMotion
-from calib.apps.monitoring.comparison.places import check_same_robot
 from calib.apps.monitoring.comparison.robot_change import RobotChange, diff
 from calib.arguments import checked
 from calib.errors import Finding, RobotError, counted, finding
@@ -87,7 +87,7 @@ class FleetReport(ReportedResult):
             RecordColumn("from", _earlier_folder, False),
             RecordColumn("to", _later_folder, False),
             RecordColumn("tool moved, mm rms", _moved_mm),
-            RecordColumn("σ of that", _expected_mm),
+            RecordColumn("expected from σ", _expected_mm),
             RecordColumn("p", "{0[1].geometry.probability:.1g}"),
             RecordColumn("", "{0[1].verdict.level}", number=False),
         ]
@@ -105,6 +105,10 @@ class FleetReport(ReportedResult):
 
         The folder contains report.html, fleet.csv (a row per arm) and metrics.json, and for each type a prior for the
         fit of the type's next arm.
+
+        Args:
+            out: the folder.
+            plots: whether figures are drawn.
         """
         out = Path(out)
         folders.check_target(out, OURS, (folders.METRICS,), "fleet report")
@@ -112,7 +116,7 @@ class FleetReport(ReportedResult):
         for arm_type in self.types:
             if arm_type.parameters:
                 robots = [arm.robot for arm in arm_type.plausible]
-                prior.write(out / PRIOR / arm_type.name, robots, arm_type.parameters)
+                arm_distribution.write(out / PRIOR / arm_type.name, robots, arm_type.parameters)
         return out
 
     def _write(self, folder: Path) -> None:
@@ -174,9 +178,9 @@ def _tables(arm_type: ArmType) -> list[Block]:
     parameters = [
         RecordColumn("parameter", "{0.name}", number=False),
         RecordColumn("arms", "{0.arms}"),
-        RecordColumn("mean", lambda row: small(row.mean, row.unit, 3)),
-        RecordColumn("sigma", lambda row: small(row.sigma, row.unit, 3)),
-        RecordColumn("width", lambda row: small(row.width, row.unit, 3)),
+        RecordColumn("mean", _mean),
+        RecordColumn("sigma", _sigma),
+        RecordColumn("width", _width),
     ]
     tool_columns = [
         RecordColumn("tool", "{0.tool}", number=False),
@@ -201,6 +205,18 @@ def _tables(arm_type: ArmType) -> list[Block]:
     ]
 
 
+def _mean(row: ParameterSpread) -> str:
+    return small(row.mean, row.unit, 3)
+
+
+def _sigma(row: ParameterSpread) -> str:
+    return small(row.sigma, row.unit, 3)
+
+
+def _width(row: ParameterSpread) -> str:
+    return small(row.width, row.unit, 3)
+
+
 def _arm_count(row: ToolUse) -> str:
     return f"{len(row.arms)}"
 
@@ -211,7 +227,13 @@ def _displacement_mm(row: ToolUse) -> str:
 
 
 def _error_sigmas(row: ToolUse) -> str:
-    """Return as text how many σ the errors with a tool exceed those with other tools; empty where they do not."""
+    """Return as text how many σ the errors with a tool exceed those with other tools.
+
+    Empty if they do not exceed them.
+
+    Args:
+        row: comparison of arms with the tool against arms with other tools.
+    """
     assert row.times is not None
     if row.times > MIN_TIMES:
         return f"{row.times_sigmas:.1f}"
@@ -277,6 +299,10 @@ def _arms_of_type(types: list[list[Calibration]], calibration: Calibration) -> l
     """Return the list in `types` of the arms with this arm's nominal description.
 
     Where there is no such list, an empty one is appended to `types` and returned.
+
+    Args:
+        types: lists of calibrations, each of arms with one nominal description.
+        calibration: calibration of the arm.
     """
     for arms in types:
         with suppress(RobotError):
@@ -315,14 +341,17 @@ def _arm_type(name: str, arms: Sequence[Calibration]) -> ArmType:
             robots.append(arm.robot)
     parameters: tuple[ParameterSpread, ...] = ()
     if robots:
-        parameters = prior.spread(robots)
+        parameters = arm_distribution.spread(robots)
     return ArmType(name, tuple(arms), tuple(failed), tuple(odd), parameters, tuple(tools(tool_uses)))
 
 
 def _farthest(calibration: Calibration) -> tuple[str, float]:
-    """Return the name of the parameter that is farthest from nominal, and its relative deviation.
+    """Return the name of the parameter that is farthest from nominal, and its deviation.
 
     The deviation is divided by the plausible one for the parameter's unit (`PLAUSIBLE`).
+
+    Args:
+        calibration: calibration of the arm.
     """
     nominal = calibration.robot.nominal or calibration.chain
     plausible = [PLAUSIBLE[unit] for unit in nominal.units]

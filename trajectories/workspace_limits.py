@@ -17,14 +17,14 @@ MIN_RADIUS = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Workspace:
-    """Limits on points' distance from the base's z axis and on their height: d_xy ≥ radius, lowest ≤ z ≤ highest.
+    """Limits on points' distance d_xy from the base's z axis and on their height: d_xy ≥ radius, lowest ≤ z ≤ highest.
 
     The limit on the distance is evaluated as (radius² - x² - y²) / (2 · radius) ≤ 0. This value is smooth on the axis
     too, and near the limit equals the missing distance [m].
 
     Attributes:
         points: q (N, n) -> (N, k, 3) positions in the base frame [m].
-        product: (q, G (N, k, 3)) -> (N, n), the slopes of Σ G · points in q.
+        product: (q, G (N, k, 3)) -> (N, n), the gradient of Σ G · points by q.
         names: (k,) names of the points.
         radius, lowest, highest: limits [m]; None for no limit.
     """
@@ -96,10 +96,10 @@ class Workspace:
 
 @dataclass(frozen=True, eq=False)
 class Clearance:
-    """Minimum distance `least` [m] between pairs of bodies.
+    """Constraint on the smallest distance between two bodies: at least `least` [m] for every given pair.
 
     Attributes:
-        distances: q (N, n) -> (N, k) distances of the pairs [m], negative where bodies overlap.
+        distances: q (N, n) -> (N, k) distances of the k pairs [m], negative where bodies overlap.
         gradients: q (N, n) -> (N, k, n), the derivatives of the distances by q.
         labels: (k,) names of the pairs.
     """
