@@ -56,7 +56,12 @@ def with_link_motion(robot: CalibratedChain, case: Case, settings: Identificatio
 
 
 def joint_terms(chain: Chain, deflection: Deflection) -> Deflection:
-    """Return the correction terms that move joints, which the dynamics use; other terms are omitted."""
+    """Return the correction terms that move joints, which the dynamics use; other terms are omitted.
+
+    Args:
+        chain: the arm, which shows the elements that joints move.
+        deflection: joint corrections of a geometric fit.
+    """
     mask = np.isin(target_elements(chain, deflection), chain.moving)
     return chosen_terms(deflection, mask)
 
@@ -68,7 +73,13 @@ def chosen_terms(deflection: Deflection, mask: np.ndarray) -> Deflection:
 
 
 def bodies_torques(terms: Deflection, case: Case, settings: IdentificationSettings) -> np.ndarray | None:
-    """Return the bodies' low-passed torques (N, n) [N m or N] along a case; None if no correction needs them."""
+    """Return the bodies' low-passed torques (N, n) [N m or N] along a case; None if no correction needs them.
+
+    Args:
+        terms: correction terms that move joints.
+        case: the recording.
+        settings: settings of the identification, with payloads and gravity.
+    """
     if not any(term.basis == "torque" for term in terms.terms) or terms.reference is None:
         return None
     model = make_model(terms.reference, settings)

@@ -217,7 +217,7 @@ def score(
         predicted: (N, rows) torques.
         slow: share of a joint's peak speed below which the joint counts as at rest, or one speed per joint [rad/s or
             m/s]; None: the default of `calib.data.signals.motion.moving`.
-        apart: rows in a different unit, excluded from totals.
+        apart: indices of rows in a different unit, excluded from totals.
     """
     motion = case.motion
     moves = moving(motion) if slow is None else moving(motion, slow)
@@ -315,7 +315,13 @@ def _score_row(
 
 
 def _sums(target: np.ndarray, residual: np.ndarray, selected: np.ndarray) -> tuple[float, float, float]:
-    """Return Σ (τ - τ̂)², Σ τ² and the number of samples, over the selected samples."""
+    """Return Σ (τ - τ̂)², Σ τ² and the number of samples, over the selected samples.
+
+    Args:
+        target: torques τ of all samples.
+        residual: their prediction errors τ - τ̂.
+        selected: mask of the samples to count.
+    """
     residual_square = float(np.sum(residual[selected] ** 2))
     target_square = float(np.sum(target[selected] ** 2))
     return residual_square, target_square, float(selected.sum())
@@ -382,7 +388,11 @@ class Dynamics(Frozen, Generic[Model]):
 def predict(dynamics: Dynamics[RegressorModel], case: Case) -> np.ndarray:
     """Return the predicted torques (N, rows) of a case at the full rate [N m or N]: W(q, v, a) · values.
 
-    W is not computed.
+    The regressor W is not computed.
+
+    Args:
+        dynamics: the model with its parameter values.
+        case: the recording.
     """
     model, motion = dynamics.model, case.motion
     states = segmented_states(model.columns, case)

@@ -499,6 +499,11 @@ def rods(chain: Chain, model: IdentificationModel, total: float = 1.0) -> np.nda
     """Return the standard parameters (B, 10) of rods from each body's frame to the next.
 
     Masses are proportional to length plus thickness, with `total` [kg] as their sum. A payload is a ball of fixed mass.
+
+    Args:
+        chain: the arm, which gives the frames.
+        model: its model, with B bodies.
+        total: sum of the masses [kg].
     """
     bodies = model.bodies
     moves = bodies.coordinates >= 0

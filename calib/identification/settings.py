@@ -178,7 +178,12 @@ def make_model(chain: Chain, settings: IdentificationSettings) -> Identification
 
 
 def make_bodies(chain: Chain, settings: IdentificationSettings) -> Bodies:
-    """Return the bodies of a chain under the stated gravity, with payloads at the tip."""
+    """Return the bodies of a chain under the stated gravity, with payloads at the tip.
+
+    Args:
+        chain: the arm.
+        settings: settings, with gravity and payloads.
+    """
     bodies = bodies_of(chain)
     if settings.gravity is not None:
         bodies = bodies.with_gravity(np.array(settings.gravity))
@@ -190,7 +195,12 @@ def make_bodies(chain: Chain, settings: IdentificationSettings) -> Bodies:
 
 
 def _check_joints(n: int, settings: IdentificationSettings) -> None:
-    """Raise a UsageError for couplings or terms of unknown joints, and for a joint coupled with itself."""
+    """Raise a UsageError for couplings or terms of unknown joints, and for a joint coupled with itself.
+
+    Args:
+        n: number of joints.
+        settings: settings, with couplings and terms.
+    """
     for coupling in settings.couplings:
         numbers = [joint + 1 for joint in coupling.joints]
         require(max(numbers) <= n, f"coupling: joints {numbers}: the robot has joints 1 to {n}", UsageError)

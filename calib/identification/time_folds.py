@@ -157,7 +157,11 @@ class CrossValidation:
         return self._results[key].copy()
 
     def extrapolated(self, columns: np.ndarray) -> np.ndarray:
-        """Return the squared errors (ranges, rows) in each held-out range of motion, for a model with these columns."""
+        """Return the squared errors (ranges, rows) in each held-out range of motion, for a model with these columns.
+
+        Args:
+            columns: indices of the model's columns.
+        """
         assert self.regimes is not None
         key = b"ranges" + np.asarray(columns, dtype=int).tobytes()
         if key in self._results:
@@ -182,7 +186,12 @@ class CrossValidation:
         return self._results.setdefault(key, np.maximum(result, 0.0))
 
     def _held_out_errors(self, columns: np.ndarray, runs: list[np.ndarray]) -> np.ndarray:
-        """Return the squared errors (blocks, rows) of ridge estimates, each run of blocks predicted from the others."""
+        """Return the squared errors (blocks, rows) of ridge estimates, each run of blocks predicted from the others.
+
+        Args:
+            columns: indices of the model's columns.
+            runs: sets of block numbers, each held out together.
+        """
         index = np.append(columns, self.data.parameters)
         squares = self._squares.take(index, 1).take(index, 2)
         prior_square = self._prior_square(index)

@@ -146,7 +146,7 @@ class FrictionCandidates:
         std, inflation: (rows,) standard deviation and variance inflation of the first fit's residuals.
         v0: (n,) smoothing of the Coulomb sign [rad/s or m/s].
         linear: (n,) whether each joint is prismatic.
-        apart: rows with a different unit, excluded from totals.
+        apart: indices of rows with a different unit, excluded from totals.
         prior: prior of the base parameters; None without one.
         torque_rows: kind of torques in the rows.
         coupled: pairs of joints, from 0, whose coupling is already in the model.
@@ -257,7 +257,7 @@ class _Bench:
         """Return the squared errors (blocks, rows) of the model with the base columns and these further columns.
 
         Args:
-            columns: indices of further columns.
+            columns: indices of further columns, counted from the first base column.
             folds: number of folds of the cross-validation; None: each time block is one.
         """
         return self.validation.errors(self._with_base(columns), folds)
@@ -380,12 +380,20 @@ def _flat(joint_sets: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
 
 
 def _carries(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return whether the rms error of cross-validation with two halves grew by a share of at most `MIN_GAIN`."""
+    """Return whether the rms error of cross-validation with two halves grew by a share of at most `MIN_GAIN`.
+
+    Args:
+        before, after: squared errors per time block without and with the tested terms.
+    """
     return bool(after.sum() <= (1.0 + MIN_GAIN) ** 2 * before.sum())
 
 
 def _extrapolates(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return whether the squared errors in held-out ranges of motion (k,) did not increase, in geometric mean."""
+    """Return whether the squared errors in held-out ranges of motion (k,) did not increase, in geometric mean.
+
+    Args:
+        before, after: (k,) squared errors in each range without and with the tested terms.
+    """
     positive = (before > 0.0) & (after > 0.0)
     if not positive.any():
         return True
@@ -393,7 +401,11 @@ def _extrapolates(before: np.ndarray, after: np.ndarray) -> bool:
 
 
 def _pays(before: np.ndarray, after: np.ndarray) -> bool:
-    """Return whether the squared errors per time block fell by enough in total, and in enough blocks."""
+    """Return whether the squared errors fell by a share of `MIN_GAIN` (rms), and in a share `MIN_BLOCKS_WON` of blocks.
+
+    Args:
+        before, after: squared errors per time block without and with the tested terms.
+    """
     positive = before > 0.0
     if not positive.any():
         return False
@@ -403,7 +415,12 @@ def _pays(before: np.ndarray, after: np.ndarray) -> bool:
 
 
 def _terms(candidates: FrictionCandidates, names: Sequence[str]) -> dict[str, list[DriveTerm]]:
-    """Return the candidate terms of each named step, for all joints."""
+    """Return the candidate terms of each named step, for all joints.
+
+    Args:
+        candidates: rows, and the data on which terms depend.
+        names: names of the steps.
+    """
     terms: dict[str, list[DriveTerm]] = {name: [] for name in names}
     if "coupling" in terms:
         terms["coupling"] = _couplings(candidates)
@@ -430,6 +447,9 @@ def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
 
     A joint is in one coupling at most. Its motor turns with the sum or the difference of the joints, whichever explains
     more.
+
+    Args:
+        candidates: rows, and the data on which terms depend.
     """
     n = candidates.n
     if not candidates.torque_rows.motors_alone:
@@ -478,6 +498,9 @@ def _couplings(candidates: FrictionCandidates) -> list[DriveTerm]:
 
 def _sampled(candidates: FrictionCandidates) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[np.ndarray]]:
     """Return about `COUPLING_ROWS` weighted samples of the recordings.
+
+    Args:
+        candidates: rows, and the data on which terms depend.
 
     Returns:
         regressor (M, n, b), torques (M, n), weights (M, n), and the list of q, v, a (n, M).

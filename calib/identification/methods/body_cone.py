@@ -55,7 +55,7 @@ class BodyCone(Frozen):
         The result is None if the cone is not binding.
 
         Args:
-            factor: (p + 1, p + 1) upper triangle [R z; 0 ρ]; base columns first.
+            factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem in β; base columns first.
             matrix: A (c, p).
             lower, upper: (c,) bounds, -inf and inf allowed.
 

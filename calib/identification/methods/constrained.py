@@ -149,7 +149,7 @@ def within(
     finite lower bounds, finite upper bounds, matrices, equalities. Multipliers of equalities have either sign.
 
     Args:
-        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ], R of full rank.
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem in b, R of full rank.
         matrix: A (c, p); the identity for bounds on single parameters.
         lower, upper: (c,), -inf and inf allowed.
         matrices: matrices that must be positive definite; None: no matrices.
@@ -340,7 +340,14 @@ def _frozen(*parts: np.ndarray) -> Constrained:
 
 
 def _widened(solution: Constrained, position: int, normals: np.ndarray, slack: np.ndarray) -> Constrained:
-    """Return the optimum with further inequalities, which are not binding, inserted at index `position`."""
+    """Return the optimum with further inequalities, which are not binding, inserted at index `position`.
+
+    Args:
+        solution: the optimum without the further inequalities.
+        position: index of the first inserted inequality in the order of `within`.
+        normals: (k, p) their derivatives.
+        slack: (k,) their distances to the bounds.
+    """
     zero = np.zeros(len(slack))
     multipliers = np.insert(solution.multipliers, position, zero)
     all_slack = np.insert(solution.slack, position, slack)

@@ -191,6 +191,10 @@ def _rows(names: Sequence[str], row: Callable[[Mapping[str, float]], np.ndarray]
 def _parsed(text: str, location: str) -> tuple[ast.expr, tuple[str, ...]]:
     """Return the syntax tree of h and the names in it, from a formula ``h``, ``left >= right`` or ``left <= right``.
 
+    Args:
+        text: the formula.
+        location: name of the constraint, for messages.
+
     Raises:
         UsageError: for a text that is not such a formula.
     """
@@ -297,7 +301,13 @@ def tangents(
 
 
 def _share(merit: Callable[[np.ndarray], float], b: np.ndarray, step: np.ndarray) -> float:
-    """Return the largest of 1, ½, ¼, … by which a step can be multiplied without an increase of the merit function."""
+    """Return the largest of 1, ½, ¼, … by which a step can be multiplied without an increase of the merit function.
+
+    Args:
+        merit: merit function of parameters (p,).
+        b: (p,) parameters before the step.
+        step: (p,) change of the parameters.
+    """
     share = 1.0
     merit_now = merit(b)
     max_halvings = 30
@@ -311,6 +321,13 @@ def _elastic(factor: np.ndarray, b: np.ndarray, bend: np.ndarray, unit: np.ndarr
 
     It represents ½ ‖R x - z‖² + ½ (x - b)ᵀ K₊ (x - b) + Σ price t + ½ ‖length t‖², where K₊ is the positive part of
     `bend` and length = ‖z‖.
+
+    Args:
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ].
+        b: (p,) point at which the constraints are linearised.
+        bend: (p, p) curvature of the constraints, whose positive part is K₊.
+        unit: (p,) units of the parameters, in which K₊ is computed.
+        price: (m,) weights of the slack.
     """
     p = len(b)
     m = len(price)

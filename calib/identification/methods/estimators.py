@@ -93,6 +93,12 @@ def _null_direction(
     Singular values of pure noise are spread between 1 ± sqrt(columns / rows) (Marchenko & Pastur 1967). If the second
     smallest one is within this range of the smallest, the noise determines the solution.
 
+    Args:
+        factor: (p + 1, p + 1) R factor of [W y].
+        noise: (p + 1,) relative noise of the columns and of y; 0 for exact columns.
+        rows: number of rows.
+        names: names of the columns, for messages.
+
     Raises:
         Unidentifiable: if the noise determines the solution, or exact columns are dependent.
     """
@@ -243,7 +249,11 @@ def _reweighted(
 
 
 def samples_of(problem: IdentificationProblem) -> Samples:
-    """Return the weighted rows of all recordings, grouped by sample."""
+    """Return the weighted rows of all recordings, grouped by sample.
+
+    Args:
+        problem: data and settings.
+    """
     rows = problem.rows
     weighted = [part.matrix * part.weight[:, :, None] for part in rows]
     matrix = np.concatenate(weighted)

@@ -263,7 +263,13 @@ class Method(ABC):
 
 
 def attempted(method: str, problem: IdentificationProblem, run: Callable[[], MethodEstimate]) -> MethodEstimate:
-    """Return the result of `run` with its computing time; a failure of the estimation becomes a status."""
+    """Return the result of `run` with its computing time; a failure of the estimation becomes a status.
+
+    Args:
+        method: name of the method.
+        problem: data and settings, with which a failure is recorded.
+        run: function that makes the estimate.
+    """
     began = time.perf_counter()
     try:
         estimate = run()

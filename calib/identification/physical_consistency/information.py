@@ -158,7 +158,13 @@ def read(folder: str | Path, model: tuple[Chain, Dynamics] | None = None) -> Inf
 
 
 def _transform(names: tuple[str, ...], groups: dict[str, dict[str, float]], standard: tuple[str, ...]) -> np.ndarray:
-    """Return the regrouping matrix T (b, p) from standard parameters; rows of additional friction are unit rows."""
+    """Return the regrouping matrix T (b, p) from standard parameters; rows of additional friction are unit rows.
+
+    Args:
+        names: names of the b estimated parameters.
+        groups: for each base parameter, its standard parameters and their coefficients.
+        standard: names of the p standard parameters.
+    """
     column_of = {name: column for column, name in enumerate(standard)}
     transform = np.zeros((len(names), len(standard)))
     for row, name in enumerate(names):

@@ -232,7 +232,12 @@ class Stepper:
 
 
 def stepper(plant: Plant, columns: np.ndarray) -> Stepper:
-    """Return a robot prepared for single time steps, with derivatives by the parameters of indices `columns` (c,)."""
+    """Return a robot prepared for single time steps, with derivatives by the parameters of indices `columns` (c,).
+
+    Args:
+        plant: the robot.
+        columns: (c,) indices of the parameters.
+    """
     find = np.full(len(plant.parameters), -1)
     numbers = 2 * plant.bodies.n + np.arange(len(columns))
     find[np.asarray(columns, dtype=int)] = numbers
@@ -263,7 +268,12 @@ class BelievedRobot:
     steps: np.ndarray | None = None
 
     def at(self, values: np.ndarray, case: Case | None = None) -> Any:
-        """Return the simulated robot with parameters (p,) and the payloads of a case; None: all payloads."""
+        """Return the simulated robot with parameters (p,) and the payloads of a case; None: all payloads.
+
+        Args:
+            values: (p,) parameters of the problem.
+            case: recording with its payloads; None: all payloads are attached.
+        """
         parameters = np.zeros(len(self.plant.parameters))
         parameters[self.columns] = values
         plant = self.plant.with_parameters(parameters)

@@ -59,7 +59,12 @@ class Uncertainty:
     covariance: np.ndarray
 
     def sigma(self, sampled: Sampled) -> np.ndarray:
-        """Return the largest standard deviation √(w Σ wᵀ) of each joint's torque along a motion (n,) [N m or N]."""
+        """Return the largest standard deviation √(w Σ wᵀ) of each joint's torque along a motion (n,) [N m or N].
+
+        Args:
+            sampled: times, positions, velocities and accelerations of the motion; w is the torque's regressor, Σ the
+                covariance.
+        """
         state = sampled.q, sampled.v, sampled.a
         variances = parameter_variances(self.dynamics, self.columns, self.covariance, *state, self.carried)
         return np.sqrt(variances.max(axis=0))[-sampled.q.shape[1] :]
@@ -67,6 +72,10 @@ class Uncertainty:
 
 def estimated_columns(dynamics: Dynamics, names: Sequence[str]) -> np.ndarray:
     """Return the regressor columns (k,) of the estimated parameters, by their names.
+
+    Args:
+        dynamics: the model.
+        names: names of the k estimated parameters; for a base parameter, its first standard parameter has the column.
 
     Raises:
         ValueError: for a name that the model does not have.
