@@ -167,6 +167,11 @@ def _soft_maximum(values: np.ndarray, sharpness: float) -> tuple[float, np.ndarr
 def _stacked(W: ArrayLike, index: Index, m: int | None) -> tuple[np.ndarray, int]:
     """Return W, checked and stacked to (m rows, p), and the number of poses m.
 
+    Args:
+        W: (m, rows, p) or (m rows, p) Jacobians of the poses.
+        index: one of "O1" ... "O5", "cond".
+        m: number of poses; None takes the length of a W with three axes.
+
     Raises:
         BadInput: an unknown index, a wrong shape, values that are not finite, or no `m` where O1 needs it.
     """

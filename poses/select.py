@@ -177,8 +177,8 @@ def select_poses(
             None too.
         m: number of poses to choose; detmax takes no candidate twice.
         settings: index, method and effort.
-        q: (N, n) joint values of the candidates [rad or m].
-        space: limits, constraints and Jacobian; needed by all methods but detmax.
+        q: (N, n) joint values of the candidates [rad or m]; None if unknown, or to draw them.
+        space: limits, constraints and Jacobian; needed by all methods but detmax. None without it.
         existing: (k, rows, p) whitened Jacobians of poses already measured, whose information is added; None for no
             such poses.
         map: the builtin, or a parallel map on which multistart runs its starts.

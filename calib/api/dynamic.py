@@ -198,11 +198,12 @@ def identify_dynamics(
         validate: recordings of other motion, which are used to validate the result only.
         method, friction: identification method (one of `methods`) and friction model, which replace those of the
             settings; None takes those of the settings.
-        options: the settings as a TOML file (``calib formats identify-options``).
+        options: the settings as a TOML file (``calib formats identify-options``), or the options read from one, given
+            instead of `settings`; None for no file.
         excitation: folder written by `design_excitation`, for methods that simulate the closed loop ([loop] in the
-            options). Its motion is the reference motion for recordings that contain none.
+            options). Its motion is the reference motion for recordings that contain none. None for no folder.
         seed: seed of all random numbers.
-        on_read: called with the inputs before the identification begins.
+        on_read: called with the inputs before the identification begins; None for no call.
         progress: called with the name of each step; None for no report.
 
     Raises:

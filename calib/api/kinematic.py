@@ -329,11 +329,11 @@ def fit_geometry(
         measured: CSV files, results of `read_poses`, or several of either.
         settings: model, loss, folds, stations, tools, rows to hold out, tolerance, seed; None takes the defaults.
         validate: poses that are not fitted but used to judge the result, in the same forms as `measured`.
-        options: units and columns that the files' headers do not state, priors, fixed parameters (``calib formats
-            options``).
+        options: units and columns that the files' headers do not state, priors, fixed parameters: in memory, or as a
+            TOML file (``calib formats options``). None takes the defaults.
         poses: the planned poses: result of `select_poses`, its CSV, or its folder. The predicted σ are compared with
             those of the fit (finding ``sigma-ratio``). None for no comparison.
-        on_read: called with the inputs before the fit begins.
+        on_read: called with the inputs before the fit begins; None for no call.
         progress: called with the name of each step; None for no report.
 
     Raises:

@@ -165,7 +165,8 @@ def design_excitation(
         options: settings of the later identification, as in `calib.identify_dynamics`. The motion is designed for the
             torque rows, drive terms, couplings and payloads in them. None takes the defaults.
         after: identified dynamics to be improved by a further motion, given instead of `model`. The motion that reduces
-            the σ of their parameters most is designed, and the reduction is predicted.
+            the σ of their parameters most is designed, and the reduction is predicted. None: the design does not refer
+            to an earlier identification.
         pick: folder of a design with a Pareto front, made with the same settings, and the number of a motion on that
             front. This motion is returned instead of a new search; None searches.
         workers: number of local processes, or the address of a Dask scheduler.

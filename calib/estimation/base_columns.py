@@ -90,7 +90,12 @@ def split_columns(
 
 
 def _with_all_columns(groups: Sequence[np.ndarray] | None, p: int) -> list[np.ndarray]:
-    """Return the groups of column indices, with a last group of all columns 0 … p - 1 that are in no group."""
+    """Return the groups of column indices, with a last group of all columns 0 … p - 1 that are in no group.
+
+    Args:
+        groups: arrays of column indices, most preferred first; None: no groups.
+        p: number of columns.
+    """
     result: list[np.ndarray] = []
     remaining = np.arange(p)
     if groups is None:

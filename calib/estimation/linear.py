@@ -45,7 +45,8 @@ class LinearFit(Frozen):
 def ols(data: Triangles, inflation: np.ndarray | None = None) -> LinearFit:
     """Estimate x = argmin ‖y - W x‖² with covariance σ² (WᵀW)⁻¹, σ² = ‖ρ‖² / (r - p), by ordinary least squares.
 
-    This covariance is correct if all groups of rows have the same noise; otherwise use `wls`.
+    This covariance is correct if the noise of y has the same standard deviation in all groups of rows; otherwise use
+    `wls`.
 
     Args:
         data: R factors of [W y].

@@ -134,10 +134,10 @@ def _concatenated(sizes: list[np.ndarray]) -> np.ndarray | None:
 
 
 def statistics(sizes: np.ndarray | None, factor: float = 1.0) -> ErrorStatistics | None:
-    """Return mean, rms, 95 % quantile and maximum of `factor` times the error magnitudes; None for None.
+    """Return mean, rms, 95 % quantile and maximum of `factor` times the error magnitudes.
 
     Args:
-        sizes: (N,) error magnitudes [m or rad].
+        sizes: (N,) error magnitudes [m or rad]; None where they were not measured.
         factor: factor by which they are converted to mm or deg.
     """
     if sizes is None:

@@ -70,6 +70,7 @@ def fit(
 ) -> GeometricFit:
     """Return the most probable geometry: all candidate parameters of the arm, each with a prior of making.
 
+    A prior of making is a normal distribution about the nominal value, as wide as plausible manufacturing deviations.
     The fit minimises Σ ‖(y - f(x)) / σ‖² + Σ ((x - x_nominal) / w)². No parameters of the arm are selected. Parameters
     that cannot be distinguished share the effect that the measurements determine, and undetermined parameters stay near
     nominal. There are three widths w of making: for joint offsets, for other angles and for lengths. They are chosen to

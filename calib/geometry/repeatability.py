@@ -88,12 +88,12 @@ class RepeatedPoses:
 
     @stored
     def orientation_repeatability_deg(self) -> MeanAndMax | None:
-        """Orientation repeatability RP, the largest of three axes, mean and maximum [deg]."""
+        """Orientation repeatability RP, the largest of three axes, mean and maximum [deg]; None if not measured."""
         return _sizes([max(pose.repeatability_deg) for pose in self.each if pose.repeatability_deg])
 
     @stored
     def orientation_accuracy_deg(self) -> dict[str, MeanAndMax | None]:
-        """Orientation accuracy AP of each arm, mean and maximum [deg]."""
+        """Orientation accuracy AP of each arm, mean and maximum over the poses [deg]; None if not measured."""
         return {
             "nominal": _sizes([_norm(pose.nominal_deg) for pose in self.each if pose.nominal_deg]),
             "calibrated": _sizes([_norm(pose.calibrated_deg) for pose in self.each if pose.calibrated_deg]),
@@ -101,7 +101,7 @@ class RepeatedPoses:
 
     @stored
     def multidirectional_mm(self) -> MeanAndMax | None:
-        """Multidirectional variation vAP of the position, mean and maximum [mm]."""
+        """Multidirectional variation vAP of the position, mean and maximum [mm]; None if not measured."""
         return _sizes([pose.multidirectional_mm for pose in self.each if pose.multidirectional_mm is not None])
 
 

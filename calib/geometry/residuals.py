@@ -122,7 +122,7 @@ class ResidualPart:
         Args:
             sigma: (rows, m) standard deviations.
             unknowns: number of parameters fitted to the residuals.
-            loss, scale: robust loss of the fit, and its constant.
+            loss, scale: robust loss of the fit, and its constant in sigmas (None: its default).
             start: True at the start of a fit, when the residuals do not yet show their common errors.
         """
         return None

@@ -371,7 +371,7 @@ class Weigher:
 
         Args:
             before: residual parts of the last pass, with their robust weights.
-            noises: for each part, the shared noise of the last pass.
+            noises: for each part, the shared noise of the last pass; None for a part without.
         """
         for piece, earlier in zip(self.pieces, before):
             change = np.abs(piece.weight - earlier.weight).max(initial=0.0)

@@ -153,7 +153,8 @@ def identify_model(
     Args:
         model: model of a serial chain, or any other `RegressorModel`.
         cases: training recordings, with the torques of the model's rows as targets.
-        settings: settings of the identification; drives, payloads and gravity are taken from `model`.
+        settings: settings of the identification, whose drives, payloads and gravity are ignored (`model` has its own);
+            None: the defaults.
         nominal: the same model on the geometry on which base columns are chosen; None: `model`.
         states: states at which base columns are compared; None: random states of the model.
         cad: the bodies' parameters from the robot's description; None if it has no masses.

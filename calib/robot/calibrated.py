@@ -384,8 +384,8 @@ def write(
     Args:
         folder: an existing folder.
         robot: the calibrated robot.
-        tables: further tables of ``robot.toml`` (`calib.robot.description.EXTRA`).
-        record: further entries of the table ``[provenance]``.
+        tables: further tables of ``robot.toml`` (`calib.robot.description.EXTRA`); None for no such tables.
+        record: further entries of the table ``[provenance]``; None for no such entries.
         comment: source of the numbers, written as a comment.
     """
     nominal = None if robot.nominal is None else robot.nominal.values

@@ -271,7 +271,7 @@ def write(path: str | Path, chain: Chain, extra: Mapping[str, object] | None = N
     Args:
         path: the file.
         chain: any chain.
-        extra: further tables by name (those named in `EXTRA`), written unchanged.
+        extra: further tables by name (those named in `EXTRA`), written unchanged; None for no such tables.
         source: source of the numbers, written as a comment.
     """
     tables.check_keys(extra or {}, EXTRA, f"robot '{chain.name}', extra tables")

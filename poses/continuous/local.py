@@ -58,7 +58,7 @@ def merit_of(
     Args:
         space: provides the Jacobian and its derivative product.
         q: (m, n) poses [rad or m].
-        index: "O1" ... "O5", "cond".
+        index: the observability index O, "O1" ... "O5" or "cond".
         existing: Jacobians (k, rows, p), or stacked (k rows, p), of poses whose information is added but which are not
             changed; None for no such poses.
         sharpness: sharpness of the smoothing, see `calib.poses.indices.merit`; infinite for the index itself.

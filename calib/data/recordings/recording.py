@@ -204,7 +204,12 @@ def rows_used(t: np.ndarray, ends: Ends, max_samples: int | None, file: str | Pa
 
 
 def in_pieces(recording: Recording, max_samples: int | None) -> Recording:
-    """Return the recording, or, if it has more than `max_samples` samples, pieces spread over it (`rows_in_pieces`)."""
+    """Return the recording, or, if it has more than `max_samples` samples, pieces spread over it (`rows_in_pieces`).
+
+    Args:
+        recording: the recording.
+        max_samples: largest number of samples; None: no limit.
+    """
     rows, notes = rows_in_pieces(recording.t, 0, len(recording), max_samples)
     if not notes:
         return recording

@@ -105,8 +105,8 @@ def cascade(
         position: P (n,), gain of the position loop [1/s].
         velocity: K (n,), gain of the velocity loop [N m s/rad].
         reset: Ti (n,), reset time [s]; infinite for a P-P cascade.
-        limit: (n,) torque limit, or one number.
-        share: share of the reference velocity.
+        limit: (n,) torque limit [N m or N], or one number.
+        share: share of the reference velocity in the velocity loop, 0 to 1.
 
     Raises:
         CalibError: for a share other than 1 with an integral part.
@@ -131,7 +131,7 @@ def computed_torque(
         frequency: ω of the error dynamics [rad/s].
         damping: damping ratio ζ.
         n: number of joints.
-        limit: (n,) torque limit, or one number.
+        limit: (n,) torque limit [N m or N], or one number.
     """
     kp = np.full(n, frequency**2)
     kd = np.full(n, 2 * damping * frequency)

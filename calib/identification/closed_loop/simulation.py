@@ -488,8 +488,8 @@ def tracking_error(
         robot: the robot that moves; for a real arm, its best available model.
         controller: its controller.
         reference: reference sampled at the controller's rate.
-        ahead: (N, n) feedforward torques, e.g. from `feed_forward`; None: those of the controller.
-        push: (N, n) additional torques; None: no additional torque.
+        ahead: (N, n) feedforward torques [N m or N], e.g. from `feed_forward`; None: those of the controller.
+        push: (N, n) additional torques [N m or N]; None: no additional torque.
     """
     run = simulate(robot, controller if ahead is None else controller.with_feedforward(ahead), reference, push=push)
     return np.sqrt(np.mean((run.q - reference.q) ** 2, axis=0))

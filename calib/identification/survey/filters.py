@@ -203,7 +203,7 @@ def _pass(before: _State, case: Case, part: slice, noise: np.ndarray) -> _State:
         before: parameters before the segment.
         case: the recording.
         part: slice of the segment.
-        noise: (n,) standard deviation of the torque noise of a sample.
+        noise: (n,) standard deviation of the torque noise of a sample [N m or N].
     """
     motion = case.motion
     thin = _thin(case)
@@ -288,9 +288,9 @@ class _Stepping:
 
         Args:
             before: belief before the step.
-            tau: (s, n) torques.
+            tau: (s, n) torques [N m or N].
             period: duration of each torque [s].
-            torque: (n,) standard deviation of the torque noise.
+            torque: (n,) standard deviation of the torque noise [N m or N].
 
         Raises:
             CannotSimulate: if not even sigma points near the mean can be simulated.

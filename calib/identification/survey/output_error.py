@@ -334,7 +334,7 @@ def _gradient(residual: np.ndarray, slopes: np.ndarray) -> np.ndarray:
     """Return the next Gauss–Newton step Qᵀ r (p,), in standard deviations of the estimate for white residuals.
 
     Args:
-        residual: (M, r) whitened residuals, or (M r,).
+        residual: (M, r) residuals divided by their standard deviations.
         slopes: (M, r, p) their Jacobian.
     """
     p = slopes.shape[2]

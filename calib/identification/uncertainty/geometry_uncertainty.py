@@ -516,7 +516,7 @@ def _rms(values: np.ndarray) -> np.ndarray:
     """Return the root mean square of each column.
 
     Args:
-        values: (M, columns) numbers, also with more axes before the last.
+        values: (M, columns) numbers.
     """
     return np.sqrt(np.mean(values**2, axis=0))
 

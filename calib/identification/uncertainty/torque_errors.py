@@ -75,7 +75,8 @@ def estimated_columns(dynamics: Dynamics, names: Sequence[str]) -> np.ndarray:
 
     Args:
         dynamics: the model.
-        names: names of the k estimated parameters; for a base parameter, its first standard parameter has the column.
+        names: names of the k estimated parameters; for a base parameter such as ``ZZ1R``, the column is that of
+            ``ZZ1``.
 
     Raises:
         ValueError: for a name that the model does not have.
