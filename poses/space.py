@@ -112,7 +112,10 @@ def constraint_gradients(space: SearchSpace, q: np.ndarray) -> np.ndarray:
 
 
 def constraint_gradient(constraint: PoseConstraint, q: np.ndarray) -> np.ndarray:
-    """Return the gradient ∂c/∂q (m, k, n) of a constraint's values c at poses q (m, n)."""
+    """Return the gradient ∂c/∂q (m, k, n) of the values c of `constraint` at poses q (m, n).
+
+    Without `PoseConstraint.gradient` it is computed by central differences.
+    """
     if constraint.gradient is not None:
         return np.asarray(constraint.gradient(q), dtype=float)
     slopes = central_difference(constraint.function, q)

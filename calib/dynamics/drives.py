@@ -292,6 +292,10 @@ def friction_states(terms: Sequence[DriveTerm], q: np.ndarray) -> np.ndarray:
     (stop operator). After a reversal the state changes in proportion to the displacement; beyond a travel of 2 · width
     it equals Coulomb's sign. Friction thus depends on past motion (Iwan 1966; several widths side by side are the
     Maxwell-slip model). There is one state for each torque row of each term with hysteresis.
+
+    Args:
+        terms: drive terms; s is 0 if none of them has hysteresis.
+        q: (n, N) joint positions x [rad or m].
     """
     from calib.dynamics import kernels
 

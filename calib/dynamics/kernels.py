@@ -549,6 +549,10 @@ def stop(x, width):
     """Return the states (N,) within ±1 of a stop operator of half-width `width` driven by positions x (N,).
 
     The first state is 0. The state follows x / width and saturates at ±1 (hysteresis of friction).
+
+    Args:
+        x: (N,) positions in order of time.
+        width: travel over which the state changes by 1.
     """
     out = np.zeros(x.shape[0])
     for k in range(1, x.shape[0]):

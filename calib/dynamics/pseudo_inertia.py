@@ -136,6 +136,10 @@ def unknown_bodies(count: int, term_count: int) -> np.ndarray:
 
     The unknowns are ten coordinates per body in the basis `UNITS`, followed by the drive parameters, on which the
     pseudo-inertias do not depend.
+
+    Args:
+        count: number of bodies.
+        term_count: number of drive parameters.
     """
     bodies = np.einsum("ij,krs->irsjk", np.eye(count), UNITS)
     bodies = bodies.reshape(count, 4, 4, 10 * count)

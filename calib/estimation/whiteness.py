@@ -74,7 +74,7 @@ def _shape(x: np.ndarray) -> tuple[float, float]:
 
 
 def _normality(skewness: float, kurtosis: float, n: int) -> float:
-    """Return the p-value of skewness and excess kurtosis of n >= 20 values under a normal distribution.
+    """Return the p-value of the hypothesis that n >= 20 values with this skewness and excess kurtosis are normal.
 
     Skewness and kurtosis are each transformed into a standard normal variable, and the sum of both squares is tested
     (D'Agostino & Pearson 1973; D'Agostino 1970; Anscombe & Glynn 1983). The result equals that of

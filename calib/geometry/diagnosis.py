@@ -372,14 +372,14 @@ def _few(blocks: Blocks) -> Blocks:
 
 
 def _turned(joint: int, angle: float, blocks: Blocks) -> Blocks:
-    """Return the blocks with `angle` [rad] added to the values of one joint."""
+    """Return the blocks with `angle` [rad] added to the values of the joint with index `joint`."""
     turn = np.zeros(blocks[0].q.shape[1])
     turn[joint] = angle
     return [replace(block, q=block.q + turn) for block in blocks]
 
 
 def _end_without(chain: Chain, joint: int) -> str | None:
-    """Return the command option that excludes joint number `joint` from a URDF's chain.
+    """Return the command option that excludes the joint with index `joint` from a URDF's chain.
 
     The option begins the chain after its first joint or ends it before its last joint; None for other joints.
     """

@@ -487,7 +487,7 @@ def _place_position(
 
 
 def _median_offset(rotation: np.ndarray, lever: np.ndarray) -> np.ndarray:
-    """Return the median (3,) of vectors `lever` (m, 3) [m], expressed in the frames of rotations (m, 3, 3)."""
+    """Return the median (3,) [m] of vectors R_iᵀ l_i, with R = `rotation` (m, 3, 3) and l = `lever` (m, 3) [m]."""
     return np.median(np.einsum("mji,mj->mi", rotation, lever), axis=0)
 
 

@@ -250,6 +250,10 @@ def _directions(measured: Positions, rows: np.ndarray) -> np.ndarray:
     """Return each row's direction of approach (k, 3), from the previous row of the file; NaN where that row is missing.
 
     Both positions are the measured ones; their errors are small against the distance between the two rows.
+
+    Args:
+        measured: the block of measurements.
+        rows: (k,) row numbers in the block.
     """
     result = np.full((len(rows), 3), np.nan)
     index = {int(number): row for row, number in reversed(list(enumerate(measured.rows)))}
@@ -265,7 +269,14 @@ def _directions(measured: Positions, rows: np.ndarray) -> np.ndarray:
 
 
 def _variation(points: np.ndarray, directions: np.ndarray) -> float:
-    """Return vAP [m] of points (k, 3) approached from directions (k, 3); NaN for fewer than two directions."""
+    """Return the multidirectional variation vAP [m] of points approached from several directions.
+
+    It is the largest distance between the means of points with different directions; NaN for fewer than two directions.
+
+    Args:
+        points: (k, 3) positions [m].
+        directions: (k, 3) direction of approach of each point; NaN where unknown.
+    """
     remaining = np.flatnonzero(~np.isnan(directions[:, 0]))
     centres: list[np.ndarray] = []
     while len(remaining):
@@ -329,7 +340,12 @@ def repeated(fit: Sequence[PoseMeasurements], unseen: Mapping[str, PoseMeasureme
 
 
 def _measured_again(fit: Sequence[PoseMeasurements], unseen: PoseMeasurements) -> np.ndarray:
-    """Return a mask (m,) of the rows of `unseen` whose joint values are those of a fitted row."""
+    """Return a mask (m,) of the rows of `unseen` whose joint values are those of a fitted row.
+
+    Args:
+        fit: the fitted blocks.
+        unseen: a block of m held-out rows.
+    """
     fitted = [block.q for block in fit if type(block) is type(unseen) and block.has_instrument]
     if not fitted:
         return np.zeros(len(unseen), dtype=bool)

@@ -82,7 +82,9 @@ class ResidualPart:
     def fill(self, residual: np.ndarray, matrix: np.ndarray, scale: np.ndarray) -> None:
         """Write residuals to `residual` (height,) and the Jacobian to `matrix` (f, height), both divided by `scale`.
 
-        The scale is broadcast to the shape of `value`.
+        Args:
+            residual, matrix: arrays to write.
+            scale: standard deviation of each residual, broadcast to the shape of `value`.
         """
         residual[:] = (self.value / scale).ravel()
         np.divide(self.jacobian, scale, out=matrix.reshape(self.jacobian.shape))
@@ -366,6 +368,10 @@ def inverse_right_jacobian(turn: np.ndarray, angular: np.ndarray) -> np.ndarray:
 
     J_r⁻¹(r) = I + [r]×/2 + (1/θ² - (1 + cos θ)/(2 θ sin θ)) [r]×²  (Chirikjian 2012, vol. 2, eq. 10.86). Since log(R_y
     (exp(ω) R)ᵀ) = log(exp(r) exp(-ω)), a rotation ω of the prediction changes the residual by -J_r⁻¹(r) ω.
+
+    Args:
+        turn: r (3, m), rotation vectors [rad].
+        angular: ω (f, 3, m), angular velocities per unit of f parameters.
     """
     theta = np.linalg.norm(turn, axis=0)
     if theta.max(initial=0.0) < 1e-9:

@@ -334,6 +334,10 @@ class Weigher:
         """Set `noise` from the weighted residuals of all parts.
 
         Errors shared by the rows of an image have their own noise model, and are excluded.
+
+        Args:
+            rows: number of measured numbers.
+            share: degrees of freedom per measured number.
         """
         squares = 0.0
         for piece in self.pieces:

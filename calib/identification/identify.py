@@ -569,6 +569,10 @@ def common_decimator(cases: Sequence[Case], settings: IdentificationSettings) ->
     If this gives more than ``settings.samples`` rows, only every second, third, … row is used. The band is not reduced:
     long recordings have redundant rows, but fast motion is identified only in a wide band.
 
+    Args:
+        cases: recordings.
+        settings: settings, with the largest number of rows.
+
     Raises:
         MeasurementError: if the sampling rates of the cases differ.
     """

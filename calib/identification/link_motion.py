@@ -34,6 +34,11 @@ def with_link_motion(robot: CalibratedChain, case: Case, settings: Identificatio
     """Return a case with the motion of its links (`Case.link`) according to the robot's joint corrections.
 
     Without joint corrections, or if the settings ignore them, the case is returned unchanged.
+
+    Args:
+        robot: the calibrated robot, with or without joint corrections.
+        case: the recording, with the motion of the motors.
+        settings: settings, which may ignore corrections (`deflections`).
     """
     simulated = settings.loop is not None or method_named(settings.method).needs_simulation
     rigid = simulated or not settings.deflections or settings.torque_rows == POWER

@@ -126,6 +126,10 @@ class LoopSettings:
     def per_joint(self, key: str, n: int) -> np.ndarray:
         """Return the n values of a key, which has one value for all joints or one per joint.
 
+        Args:
+            key: name of the setting.
+            n: number of joints.
+
         Raises:
             UsageError: for another number of values.
         """

@@ -331,6 +331,10 @@ def _prediction_errors(sums: np.ndarray, apart: Sequence[int]) -> PredictionErro
     """Return prediction errors from sums (rows, 3) of the torque rows: Σ (τ - τ̂)², Σ τ² and number of samples.
 
     The total excludes the rows `apart`.
+
+    Args:
+        sums: one row per torque row.
+        apart: indices of rows in a different unit.
     """
     square, size, count = np.array(sums).T
     same_unit = ~np.isin(np.arange(len(square)), apart)
@@ -348,6 +352,10 @@ def _whiteness(residual: np.ndarray, segment: np.ndarray) -> tuple[Whiteness | N
     """Return the whiteness test of each row of decimated residuals (M, rows), in the longest segment.
 
     The test is None for a row with too few samples or without variation.
+
+    Args:
+        residual: residuals τ - τ̂ at the decimated samples.
+        segment: (M,) number of the gap-free segment of each sample.
     """
     tests: list[Whiteness | None] = []
     for column in residual[longest(segment)].T:

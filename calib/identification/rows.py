@@ -242,6 +242,10 @@ class ObservationRows:
         """Return the rows with the columns (M, rows, k) of drive terms appended.
 
         Columns whose value at rest is unknown are set to zero in standstills.
+
+        Args:
+            terms: k drive terms.
+            columns: their columns, from `observe_terms`.
         """
         if not terms:
             return self
@@ -431,6 +435,10 @@ def with_blocks(all_rows: Sequence[ObservationRows], count: int) -> list[Observa
 
     Blocks are contiguous, about `count` in all, with at least one per case. Samples within `CUT_MARGIN` of a cut
     between blocks get -1, since the filter's window extends across the cut.
+
+    Args:
+        all_rows: rows of all cases.
+        count: approximate number of blocks.
     """
     total = sum(len(rows.target) for rows in all_rows)
     numbered = []

@@ -143,6 +143,10 @@ class IdentificationSettings(Choices):
 def make_model(chain: Chain, settings: IdentificationSettings) -> IdentificationModel:
     """Return the model of a chain: bodies, payloads at the tip, and drive terms.
 
+    Args:
+        chain: the arm.
+        settings: settings, with drive terms, payloads and gravity.
+
     Raises:
         UsageError: for settings that do not apply to this chain.
     """
@@ -220,6 +224,10 @@ def _check_joints(n: int, settings: IdentificationSettings) -> None:
 
 def require_usable(settings: IdentificationSettings, method: Method) -> IdentificationSettings:
     """Return the settings for a method, with friction = "auto" replaced by its meaning for this method.
+
+    Args:
+        settings: the requested settings.
+        method: the method that will be used.
 
     Raises:
         UsageError: for a missing loop, or torque rows or friction that the method does not support; the message names

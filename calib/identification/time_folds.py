@@ -263,7 +263,12 @@ def estimate(
 
 
 def _kinds(group: np.ndarray, units: Sequence[str]) -> np.ndarray:
-    """Return a number (p,) that is equal for columns of the same group and unit; -1 for columns without a group."""
+    """Return a number (p,) that is equal for columns of the same group and unit; -1 for columns without a group.
+
+    Args:
+        group: (p,) ridge group of each column; -1 for none.
+        units: unit of each column.
+    """
     distinct, unit = np.unique(units, return_inverse=True)
     return np.where(group < 0, -1, group * len(distinct) + unit)
 

@@ -136,7 +136,7 @@ def _carry(r, x, body, attached, lines, first):
 
 @njit(**OPTIONS)
 def _put(x, lines, row, first):
-    """Write x (3,) into a row of `lines`, starting at column `first` (numba compiles slices slowly)."""
+    """Write x (3,) into row `row` of `lines`, starting at column `first` (numba compiles slices slowly)."""
     for a in range(3):
         lines[row, first + a] = x[a]
 

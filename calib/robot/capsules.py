@@ -528,7 +528,7 @@ def _attached_ends(chain: Chain, q: np.ndarray, beside: Sequence[Attached]) -> t
 def _nearest(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the positions (...) of the nearest points on the segments a to b and c to d: 0 at a or c, 1 at b or d.
 
-    The ends of the segments are (..., 3).
+    The ends a, b, c, d of the segments are (..., 3).
     """
     u, v, w = b - a, d - c, a - c
     uu = np.maximum((u * u).sum(-1), MIN_SQUARE)

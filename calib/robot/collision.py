@@ -336,7 +336,13 @@ def _attach(
 def _surround(
     geometry: NativeShape, base_pose: NativeShape, walls: Sequence[Wall], obstacles: Sequence[Obstacle]
 ) -> None:
-    """Add walls and obstacles to `geometry`, fixed in the world, from their poses in the arm's base."""
+    """Add walls and obstacles to `geometry`, fixed in the world, from their poses in the arm's base.
+
+    Args:
+        geometry: coal's shapes, to which is added.
+        base_pose: pose of the arm's base in the world, as Pinocchio's SE3.
+        walls, obstacles: walls and obstacles in the base frame.
+    """
     pin, coal = _libraries()
 
     def add(name: str, shape: NativeShape, T_base_shape: np.ndarray) -> None:

@@ -173,7 +173,12 @@ def _newcomer(
 
 
 def _spanning(rows: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
-    """Return log det(εI + information) (K,) of `rows` with each of K Jacobians added, columns scaled by their rms."""
+    """Return log det(εI + information) (K,) of `rows` with each of K Jacobians added, columns scaled by their rms.
+
+    Args:
+        rows: (R, p) Jacobian rows of the poses chosen so far.
+        jacobians: (K, rows, p) Jacobians of the poses that may be added.
+    """
     mean_squares = (jacobians**2).mean((0, 1))
     scale = np.sqrt(mean_squares)
     scale = np.where(scale > 0, scale, 1.0)

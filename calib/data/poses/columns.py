@@ -165,7 +165,12 @@ class Sheet:
         self.fail(f"{message}. Map them in the options' [columns]")
 
     def _refuse_more_joints(self, columns: Sequence[str], n: int) -> None:
-        """Raise MeasurementError for a table with more numbered joint columns than the robot has joints."""
+        """Raise MeasurementError for a table with more numbered joint columns than the robot has joints.
+
+        Args:
+            columns: the file's names of the joint columns that were found.
+            n: number of the robot's joints.
+        """
         if not all(_NUMBERED_JOINT.fullmatch(name) for name in columns):
             return
         for name in self.table.header:

@@ -166,6 +166,10 @@ def _drop_spikes(recording: Recording, joints: Joints | None) -> Recording:
     Let b be the bound that all but `max_spike_share` of the rows do not exceed. A spike exceeds both `max_effort` times
     the joint's limit and `min_spike_beyond` times b; or, whatever the limit, `min_spike` times b.
 
+    Args:
+        recording: the recording.
+        joints: the robot's joints with their limits; None: unknown limits.
+
     Raises:
         MeasurementError: more rows than the allowed share, but at most `max_unit_share`, have such torques.
     """

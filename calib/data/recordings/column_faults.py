@@ -201,6 +201,10 @@ def _moved(t: np.ndarray, v: np.ndarray) -> float:
     """Return the range of the integral of velocities v (N,) [rad or m].
 
     Gaps in the time stamps count as short steps.
+
+    Args:
+        t: (N,) time stamps [s].
+        v: (N,) velocities of one joint [rad/s or m/s].
     """
     step = np.diff(t)
     step = np.minimum(step, 3.0 * np.median(step))
@@ -210,13 +214,23 @@ def _moved(t: np.ndarray, v: np.ndarray) -> float:
 
 
 def _wander(t: np.ndarray, v: np.ndarray) -> float:
-    """Return the largest plausible drift [rad or m] that white noise causes in the integral of velocities v (N,)."""
+    """Return the largest plausible drift [rad or m] that white noise causes in the integral of velocities v (N,).
+
+    Args:
+        t: (N,) time stamps [s].
+        v: (N,) velocities of one joint [rad/s or m/s].
+    """
     noise = float(np.std(np.diff(v))) / np.sqrt(2.0)
     return MAX_WANDER * noise * float(np.median(np.diff(t))) * float(np.sqrt(len(t)))
 
 
 def _speed(t: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """Return the slope (N,) of positions q (N,), from the row `REACH` rows before to the row `REACH` rows after."""
+    """Return the slope (N,) of positions q (N,), from the row `REACH` rows before to the row `REACH` rows after.
+
+    Args:
+        t: (N,) time stamps [s].
+        q: (N,) positions of one joint [rad or m].
+    """
     rows = np.arange(len(t))
     behind = np.minimum(rows + REACH, len(t) - 1)
     before = np.maximum(rows - REACH, 0)

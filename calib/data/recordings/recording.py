@@ -138,6 +138,9 @@ class Recording:
     def cut(self, start: float | None = None, stop: float | None = None) -> Recording:
         """Return the recording of the samples with start ≤ t < stop [s]; None: no bound at that end.
 
+        Args:
+            start, stop: begin and end of the part [s], counted from the file's first sample.
+
         Raises:
             MeasurementError: no sample is in the interval.
         """
@@ -232,6 +235,10 @@ def earlier(recording: Recording, lag: float) -> Recording:
     """Return the recording with torques and currents shifted `lag` [s] earlier, to the time of the positions.
 
     Samples for which there is no torque are removed.
+
+    Args:
+        recording: the recording.
+        lag: delay of the torques behind the positions of the same row [s].
 
     Raises:
         MeasurementError: no sample remains.

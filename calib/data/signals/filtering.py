@@ -88,6 +88,10 @@ def factor_for(rate: float, band: float) -> int:
     """Return the largest decimation factor n_d whose filter passes `band` f_p [Hz], at least 1.
 
     n_d = floor(0.8 rate / (2 f_p))
+
+    Args:
+        rate: sampling rate before decimation [Hz].
+        band: f_p, highest frequency to keep [Hz].
     """
     return max(1, int(SHARE * rate / (2 * band) + 1e-9))
 

@@ -469,12 +469,23 @@ def _interpolate(
 
 
 def _on_grid(t: np.ndarray, grid: np.ndarray) -> bool:
-    """Return whether sample times equal the times of a grid up to rounding."""
+    """Return whether sample times equal the times of a grid up to rounding.
+
+    Args:
+        t: (N,) times of the samples [s].
+        grid: times of the grid [s].
+    """
     return len(t) == len(grid) and bool(np.abs(grid - t).max() < 1e-6 * (grid[1] - grid[0]))
 
 
 def _weight(t: np.ndarray, grid: np.ndarray, period: float) -> np.ndarray:
-    """Return the weight of each time of a grid: 1 if a sample is within 0.75 periods, else 0."""
+    """Return the weight of each time of a grid: 1 if a sample is within 0.75 periods, else 0.
+
+    Args:
+        t: times of the samples [s].
+        grid: times of the grid [s].
+        period: sampling period [s].
+    """
     after = np.clip(np.searchsorted(t, grid), 1, len(t) - 1)
     distance = np.minimum(np.abs(grid - t[after - 1]), np.abs(t[after] - grid))
     return (distance < SAMPLE_REACH * period).astype(float)

@@ -195,7 +195,7 @@ def row_changes(fit: GeometricFit) -> list[Finding]:
 
 
 def _rows_of(fit: GeometricFit, number: int) -> WhitenedRows:
-    """Return the whitened rows of block `number` of a fit, with the columns of all rigid parameters."""
+    """Return the whitened rows of the block with index `number` in a fit, with the columns of all rigid parameters."""
     measured = fit.blocks[number].measured
     (block,) = prepare(fit.cell, [take(measured, evenly(len(measured), MAX_ROWS))])
     table = layout(fit.cell)
@@ -410,7 +410,12 @@ def _gains_over_other_orders(rows: WhitenedRows, residuals: np.ndarray, subjects
 
 
 def _holds_on_held_out(rows: WhitenedRows, change: RowChange) -> bool:
-    """Return whether the change also reduces the residuals of held-out rows, every k-th row being held out in turn."""
+    """Return whether the change also reduces the residuals of held-out rows, every k-th row being held out in turn.
+
+    Args:
+        rows: the whitened rows of one block.
+        change: the change, whose columns are added.
+    """
     changed = rows.with_columns(change.columns)
     count = len(rows.residual)
     squares = changed_squares = 0.0
@@ -423,7 +428,12 @@ def _holds_on_held_out(rows: WhitenedRows, change: RowChange) -> bool:
 
 
 def _squares_on(rows: WhitenedRows, held_out: np.ndarray, fitted: np.ndarray) -> float:
-    """Return the sum of squares of the rows `held_out`, predicted with the estimate from the rows `fitted`."""
+    """Return the sum of squares of the rows `held_out`, predicted with the estimate from the rows `fitted`.
+
+    Args:
+        rows: the whitened rows of one block.
+        held_out, fitted: row numbers.
+    """
     residuals = rows.some(held_out).residuals(rows.some(fitted).solve())
     return float(np.sum(residuals**2))
 

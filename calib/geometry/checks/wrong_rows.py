@@ -136,7 +136,13 @@ def _shifted_block(number: int, first: int, shift: int, blocks: Blocks) -> Block
 
 
 def _shifted(block: Positions, first: int, shift: int) -> Positions:
-    """Return a block whose rows from number `first` on have the joint values of the row `shift` rows further down."""
+    """Return a block whose rows from number `first` on have the joint values of the row `shift` rows further down.
+
+    Args:
+        block: measured positions.
+        first: row number in the file.
+        shift: number of rows; negative: rows further up.
+    """
     numbers, index = np.unique(block.rows, return_index=True)
     source = np.where(block.rows >= first, block.rows + shift, block.rows)
     position = np.minimum(np.searchsorted(numbers, source), len(numbers) - 1)
@@ -190,7 +196,7 @@ def two_targets(nominal: Installation, blocks: Blocks, max_left: float) -> list[
 
 
 def _divided(number: int, second: frozenset[int], blocks: Blocks) -> Blocks:
-    """Return the blocks with the rows `second` of block `number` assigned to a second target."""
+    """Return the blocks with the rows `second` of the block with index `number` assigned to a second target."""
     block = blocks[number]
     tool = np.isin(block.rows, list(second)).astype(int)
     name = block.tool_names[0]

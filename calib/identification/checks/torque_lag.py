@@ -332,9 +332,9 @@ def _turning(samples: MotionSamples, rate: float) -> list[np.ndarray]:
 
 
 def _parabola_minimum(values: np.ndarray, index: int) -> float:
-    """Return the minimum of the parabola through the value at an index and its two neighbours.
+    """Return where the parabola through values[index] and its two neighbours is smallest, as an offset from `index`.
 
-    The result is an offset in indices; 0 at the ends of the array, or if the parabola has no minimum.
+    The result is 0 at the ends of the array, or if the parabola has no minimum.
     """
     if not 0 < index < len(values) - 1:
         return 0.0

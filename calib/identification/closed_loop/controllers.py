@@ -160,6 +160,10 @@ def completed(controller: LoopController, loop: LoopSettings, n: int) -> LoopCon
 def stated_controller(loop: LoopSettings, n: int) -> LoopController:
     """Return the controller of n joints that the table [loop] describes.
 
+    Args:
+        loop: the table [loop], in which a list has one value or n.
+        n: number of joints.
+
     Raises:
         UsageError: if the length of a list is not the number of joints.
     """

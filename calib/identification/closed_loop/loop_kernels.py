@@ -41,7 +41,10 @@ FINE, SINGULAR, STIFF, DIVERGED = -1, 1, 2, 3
 
 @njit(**JOINED)
 def twist_cross(w, v, u, s):
-    """Return the cross product of two twists, (w, v) × (u, s), as its angular and linear parts."""
+    """Return the cross product of two twists, (w, v) × (u, s), as its angular and linear parts.
+
+    The first vector of a twist is its angular, the second its linear velocity.
+    """
     return cross(w, u), add(cross(w, s), cross(v, u))
 
 

@@ -378,6 +378,10 @@ def body_rows(bodies: Bodies, parameters: np.ndarray) -> np.ndarray:
     """Return placements and parameters of the bodies as the array `body` (B + 1, 23) of `loop_kernels`.
 
     Frames are rotated so that each joint moves about or along z.
+
+    Args:
+        bodies: the B bodies.
+        parameters: (10 B,) their standard parameters.
     """
     result = np.zeros((bodies.count + 1, 23))
     result[-1, :3] = -bodies.gravity

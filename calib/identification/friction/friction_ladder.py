@@ -315,7 +315,12 @@ class _Bench:
         return accepted, self.errors([*selected, *accepted]), _flat(at)
 
     def _rows(self, joints: tuple[int, ...], side: str) -> list[int]:
-        """Return the torque rows that terms of these joints affect, on the ``link`` or ``motor`` side."""
+        """Return the indices of the torque rows that terms of these joints affect, on one side of the gears.
+
+        Args:
+            joints: joints, from 0.
+            side: ``link`` or ``motor``.
+        """
         torque_rows = self.candidates.torque_rows
         rows: list[int] = []
         for joint in joints:

@@ -118,7 +118,12 @@ class BodyCone(Frozen):
 
 
 def cone_of(model: RegressorModel, base: Base) -> BodyCone:
-    """Return the cone of physically consistent base parameters of a model."""
+    """Return the cone of physically consistent base parameters of a model.
+
+    Args:
+        model: model of standard parameters.
+        base: its base parameters.
+    """
     labels = tuple(name.removeprefix("XX") for name in model.names[: model.inertial : 10])
     positive = [column.nonnegative for column in model.columns]
     return BodyCone(np.asarray(base.transform), labels, np.array(positive, dtype=bool))

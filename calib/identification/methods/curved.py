@@ -121,7 +121,7 @@ def _sizes(u: np.ndarray) -> np.ndarray:
 
 
 def _differences(function: Callable[[np.ndarray], np.ndarray], u: np.ndarray) -> np.ndarray:
-    """Return the Jacobian (m, k) of a function of u (k,), by central differences."""
+    """Return the Jacobian (m, k) of a function from u (k,) to m numbers at u, by central differences."""
     steps = np.diag(1e-5 * _sizes(u))
     slopes = []
     for step in steps:

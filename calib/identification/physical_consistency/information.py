@@ -175,5 +175,10 @@ def _transform(names: tuple[str, ...], groups: dict[str, dict[str, float]], stan
 
 
 def write(identification: Identification, folder: Path) -> None:
-    """Write the R factor [R z] of an identification's data to ``information.csv`` in `folder`."""
+    """Write the R factor [R z] of an identification's data to ``information.csv`` in `folder`.
+
+    Args:
+        identification: the result in memory.
+        folder: an existing folder.
+    """
     files.write_numbers(folder / INFORMATION, (*identification.names, "target"), _information(identification))

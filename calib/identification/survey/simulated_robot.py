@@ -321,6 +321,10 @@ class BelievedRobot:
 def serial_arm(problem: IdentificationProblem, method: Method) -> IdentificationModel:
     """Return the model of a problem, which must be a serial arm with torque rows that the method supports.
 
+    Args:
+        problem: data and settings.
+        method: the method that simulates.
+
     Raises:
         UsageError: for any other model.
     """
@@ -373,7 +377,12 @@ def believed_robot(problem: IdentificationProblem, method: Method, steps: np.nda
 
 
 def with_friction(problem: IdentificationProblem, model: IdentificationModel) -> tuple[IdentificationModel, np.ndarray]:
-    """Return a problem's model with all friction terms, and the index (p,) of each of its parameters in this model."""
+    """Return a problem's model with all friction terms, and the index (p,) of each of its parameters in this model.
+
+    Args:
+        problem: data and settings, with p parameters.
+        model: the problem's model with standard friction.
+    """
     extra = [term for term in problem.terms[problem.base.b :] if term is not None]
     model = model.with_terms(*extra)
     extra_columns = range(model.p - len(extra), model.p)

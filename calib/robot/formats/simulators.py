@@ -73,7 +73,7 @@ def mjcf_text(chain: Chain, bodies: np.ndarray, armature: np.ndarray, damping: n
 
 
 def joint_name(chain: Chain, k: int) -> str:
-    """Return the MJCF joint name of the moving element k: the chain joint's name, or the name of a mimic follower."""
+    """Return the MJCF name of the joint that moves element k: the chain joint's name, or that of a mimic follower."""
     element = chain.elements[k]
     main = k in chain.moving.tolist()
     return chain.joints[element.joint or 0].name if main else element.name.removesuffix(".offset")
@@ -107,7 +107,7 @@ def tip_poses(source: str, chain: Chain, q: np.ndarray) -> np.ndarray:
 
 
 def link_frame(model: NativeModel, link: str) -> int:
-    """Return the index of a link's frame in Pinocchio's model; a joint of the same name is not meant."""
+    """Return the index of the frame of the link named `link` in Pinocchio's model; a joint of this name is ignored."""
     pin = import_module("pinocchio")
     return model.getFrameId(link, pin.FrameType.BODY)
 

@@ -334,7 +334,11 @@ class UrdfTree:
         return [link for link in self.bodies if link not in self.above]
 
     def link(self, name: str, role: str) -> str:
-        """Return `name` if a link has this name; `role` (base or tip) is used in the message otherwise.
+        """Return `name` if a link has this name.
+
+        Args:
+            name: name of the link.
+            role: ``base`` or ``tip``, for the message.
 
         Raises:
             RobotError: there is no such link; the message suggests the most similar name.

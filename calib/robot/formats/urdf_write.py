@@ -290,7 +290,12 @@ def _screw(axis: np.ndarray, amount: np.ndarray, slides: bool) -> np.ndarray:
 
 
 def _motion(element: Element, amount: float | np.ndarray) -> np.ndarray:
-    """Return the transform exp(sign · axis · amount) of an element, (4, 4), or (m, 4, 4) for amounts (m,)."""
+    """Return the transform exp(sign · axis · amount) of an element, (4, 4), or (m, 4, 4) for amounts (m,).
+
+    Args:
+        element: the element, which gives sign and axis.
+        amount: displacement along or about the axis [m or rad].
+    """
     axis = element.sign * np.eye(3)[AXES.index(element.axis) % 3]
     return _screw(axis, np.asarray(amount, dtype=float), element.axis[0] == "t")
 
