@@ -250,7 +250,7 @@ def fill_energies(terms: Sequence[DriveTerm], out: np.ndarray, v: np.ndarray) ->
     Args:
         terms: k drive terms.
         out: (k, N) energies.
-        v: (n, N) velocities.
+        v: (n, N) joint velocities [rad/s or m/s].
     """
     for column, term in zip(out, terms, strict=True):
         if term.shape != "acceleration":

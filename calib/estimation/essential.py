@@ -96,8 +96,8 @@ def eliminate(
         level: significance level of each test, i.e. the probability of keeping a parameter that is zero.
         keep: names of parameters that are never dropped.
         drop: names of parameters that are dropped first, whatever the rule.
-        std: (g,) noise standard deviations of the groups of rows; None: `settled_std` of the base model. They remain
-            constant during the elimination.
+        std: (g,) noise standard deviations of the groups of rows, in units of y; None: `settled_std` of the base model.
+            They remain constant during the elimination.
         inflation: (g,) variance inflation of autocorrelated residuals (module `linear`); without it too many parameters
             are kept.
 

@@ -174,7 +174,7 @@ def _fit(data: Triangles, std: np.ndarray, inflation: np.ndarray | None, stated:
 
     Args:
         data: R factors of [W y].
-        std: (g,) standard deviations of the groups.
+        std: (g,) noise standard deviations of the groups of rows, in units of y.
         inflation: (g,) variance inflation of each group; None: 1.
         stated: whether `std` is the noise itself; if not, only its proportions are used and the residuals give the
             scale of the covariance.
@@ -209,7 +209,7 @@ def _pack(
     Args:
         data: R factors of [W y].
         values, covariance: (p,) estimate and its (p, p) covariance.
-        std, tau: (g,) standard deviations and variance inflation of the groups.
+        std, tau: (g,) noise standard deviation (in units of y) and variance inflation of each group of rows.
         inverse: (p, p) R⁻¹ of the weighted W.
         conditions: condition numbers of the weighted W, as it is and with unit-norm columns.
 

@@ -157,7 +157,7 @@ def combine(data: Triangles, std: np.ndarray | None = None) -> np.ndarray:
 
     Args:
         data: R factors of the groups.
-        std: (g,) standard deviations; None: rows are not divided.
+        std: (g,) noise standard deviation of each group of rows, in units of y; None: rows are not divided.
 
     Raises:
         CalibError: for a standard deviation that is not positive.

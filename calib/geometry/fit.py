@@ -256,7 +256,7 @@ def _making(
         cell: the nominal installation.
         blocks: measurements prepared for it.
         free: (f,) indices in the parameter vector.
-        prior: (f,) initial standard deviations; infinite for none.
+        prior: (f,) initial standard deviations of the prior [m or rad]; infinite for no prior.
         has_stated_prior: (f,) mask of the parameters whose prior was given by the user and is kept.
         settings: settings of the fit.
     """
@@ -371,7 +371,8 @@ def fit_with_prior(
         cell: installation to start from.
         blocks: measurements prepared for this installation.
         free: (f,) indices in the parameter vector.
-        prior: (f,) standard deviations, infinite for no prior; None for no prior at all.
+        prior: (f,) standard deviations of the parameters about nominal [m or rad], infinite for no prior; None for no
+            prior at all.
         settings: settings of the fit; None for the defaults.
         nominal: mean of the prior; None for `cell`.
         warm: True where `cell` is already fitted, so that the first sigmas can be estimated from its residuals.

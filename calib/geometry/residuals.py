@@ -122,7 +122,7 @@ class ResidualPart:
         """Return the errors that rows share, estimated from the residuals; None for kinds without shared errors.
 
         Args:
-            sigma: (rows, m) standard deviations.
+            sigma: (rows, m) standard deviations of the residuals, in their unit.
             unknowns: number of parameters fitted to the residuals.
             loss, scale: robust loss of the fit, and its constant in sigmas (None: its default).
             start: True at the start of a fit, when the residuals do not yet show their common errors.
@@ -133,7 +133,7 @@ class ResidualPart:
         """Return the residuals (rows, m) without the errors that rows share.
 
         Args:
-            sigma: (rows, m) standard deviations.
+            sigma: (rows, m) standard deviations of the residuals, in their unit.
         """
         return self.value
 

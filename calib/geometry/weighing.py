@@ -573,6 +573,6 @@ def _size(part: ResidualPart, sigma: np.ndarray) -> np.ndarray:
 
     Args:
         part: residuals of m rows.
-        sigma: (rows, m) standard deviations.
+        sigma: (rows, m) standard deviations of the residuals, in their unit.
     """
     return np.sqrt(np.mean((part.alone(sigma) / sigma) ** 2, axis=0))

@@ -252,7 +252,7 @@ def _first_fit(
         rows: rows of all recordings.
         find: function of the rows that returns their prior.
         takes_prior: whether to use a prior.
-        noise: (rows,) stated torque noise; None: from the residuals.
+        noise: (rows,) stated standard deviation of the torque noise, up to a common factor; None: from the residuals.
     """
     if takes_prior:
         prior = find(rows)

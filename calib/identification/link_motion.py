@@ -107,7 +107,7 @@ def motion_of_bases(terms: Deflection, motion: Motion, torque: np.ndarray | None
     Args:
         terms: E correction terms.
         motion: motion of the joints.
-        torque: (N, n) torques of the bodies; None if no term depends on torque.
+        torque: (N, n) torques of the bodies [N m or N]; None if no term depends on torque.
     """
     result = np.zeros((3, len(terms.terms), len(motion)))
     result[0] = evaluate(terms, motion.q, torque)

@@ -187,7 +187,7 @@ def relative_error_sigma(measured: np.ndarray, predicted: np.ndarray) -> float:
     samples: Künsch 1989); ten blocks are our choice.
 
     Args:
-        measured, predicted: (rows, N) torques.
+        measured, predicted: (rows, N) torques τ and τ̂, in one unit.
 
     Returns:
         the standard error; NaN if there are fewer than two samples for each block, or no torque.
@@ -214,7 +214,7 @@ def score(
 
     Args:
         case: the recording.
-        predicted: (N, rows) torques.
+        predicted: (N, rows) predicted torques, in the unit of the recorded ones.
         slow: share of a joint's peak speed below which the joint counts as at rest, or one speed per joint [rad/s or
             m/s]; None: the default of `calib.data.signals.motion.moving`.
         apart: indices of rows in a different unit, excluded from totals.

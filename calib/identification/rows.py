@@ -171,7 +171,7 @@ class ObservationRows:
     Attributes:
         names, units: names and units of the p columns.
         matrix: (M, rows, p) observation matrix W.
-        target: (M, rows) torques y.
+        target: (M, rows) torques y [N m or N].
         present: (M, rows) mask of rows used for training.
         block: (M,) number of the time block, for cross-validation; -1 near a cut between blocks.
         rate: sampling rate [Hz].

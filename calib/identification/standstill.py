@@ -228,8 +228,8 @@ class DividedRows:
 
         Args:
             values: (p,) parameters.
-            std, tau: (rows,) standard deviation of the residuals in motion, and number of these residuals that count as
-                one.
+            std, tau: (rows,) standard deviation of the residuals in motion [N m or N], and number of these residuals
+                that count as one.
         """
         count = np.maximum(self.standstills, 1.0)
         friction = np.sum(np.abs(values) * self.coulomb, axis=1)
@@ -415,7 +415,7 @@ def left_out_error(
     Args:
         training: rows with the tested treatment of standstills.
         marked: the same samples with their standstills marked.
-        std, inflation: (rows,) standard deviation and variance inflation of the residuals.
+        std, inflation: (rows,) standard deviation [N m or N] and variance inflation of the residuals.
         prior: whitened rows (k, p + 1) of [W y]; None without a prior.
         apart: indices of torque rows in a different unit, excluded from the sum.
     """

@@ -122,7 +122,7 @@ class CrossValidation:
         data: R factors by time block and torque row.
         rows: number of torque rows per sample.
         blocks: number of time blocks, each held out in turn.
-        std: (rows,) standard deviation of the residuals.
+        std: (rows,) standard deviation of the residuals [N m or N].
         inflation: (rows,) variance inflation, i.e. number of rows that count as one.
         group: (p,) ridge group of each column, -1 for none.
         prior: (k, p + 1) whitened rows of [W y] of a prior; None without one.
@@ -243,7 +243,7 @@ def estimate(
 
     Args:
         data: R factors, one group per torque row.
-        std, inflation: (rows,) standard deviation and variance inflation of the residuals.
+        std, inflation: (rows,) standard deviation [N m or N] and variance inflation of the residuals.
         group: (p,) ridge group of each column; -1 for none.
         prior: (k, p + 1) whitened rows of [W y] of a prior; None without one.
     """

@@ -55,8 +55,8 @@ def column_faults(
     Args:
         t: (N,) time stamps as logged [s].
         q: (N, n) positions [rad or m].
-        effort: (N, n) torques or currents.
-        v: (N, n) measured velocities; None if not recorded.
+        effort: (N, n) torques [N m or N] or currents [A].
+        v: (N, n) measured velocities [rad/s or m/s]; None if not recorded.
     """
     faults = []
     for joint, position in enumerate(q.T):
@@ -111,7 +111,7 @@ def _standing_position(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) 
         joint: index of the joint.
         t: (N,) time stamps [s].
         q: (N,) positions of the joint [rad or m].
-        v: (N,) measured velocities of the joint.
+        v: (N,) measured velocities of the joint [rad/s or m/s].
     """
     min_travel = max(MIN_TRAVEL, MIN_STEPS * _resolution(q))
     parts = []
@@ -131,7 +131,7 @@ def _standing_velocity(joint: int, t: np.ndarray, q: np.ndarray, v: np.ndarray) 
         joint: index of the joint.
         t: (N,) time stamps [s].
         q: (N,) positions of the joint [rad or m].
-        v: (N,) measured velocities of the joint.
+        v: (N,) measured velocities of the joint [rad/s or m/s].
     """
     parts = []
     for first, last in _constant(v):

@@ -342,7 +342,7 @@ def _velocity_cutoff(cutoffs: Cutoffs, cutoff: np.ndarray, a: np.ndarray, rate: 
     Args:
         cutoffs: proposed cut-offs, with the position noise.
         cutoff: (n,) cut-off f_q of the positions [Hz].
-        a: (N, n) accelerations.
+        a: (N, n) accelerations [rad/s² or m/s²].
         rate: sampling rate [Hz].
     """
     rms = np.sqrt(np.mean(a**2, axis=0))

@@ -328,7 +328,7 @@ class MotionSamples:
     Attributes:
         index: (N,) indices of the samples in the motion.
         q, v, a: (N, n) [rad or m, per s, per s²].
-        effort, velocity: (M, n) smoothed torques, and velocities, of all M samples of the motion.
+        effort, velocity: (M, n) smoothed torques [N m or N], and velocities [per s], of all M samples of the motion.
         bodies: rigid bodies of the robot.
     """
 

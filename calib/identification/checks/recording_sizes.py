@@ -141,8 +141,8 @@ def common_factor(torque: np.ndarray, common: np.ndarray, free: np.ndarray) -> t
     """Return α and its sigma for torques τ (m, n) = α `common` + `free` x, each joint weighted by its residual.
 
     Args:
-        torque: (m, n) torques τ.
-        common: (m, n) torques whose factor α all joints share.
+        torque: (m, n) torques τ [N m or N].
+        common: (m, n) torques whose factor α all joints share, in the unit of τ.
         free: (m, n, p) columns with free parameters x.
     """
     m, n = torque.shape
@@ -438,7 +438,7 @@ def _speed_ratio(
 
     Args:
         t: (N,) times [s].
-        q, v: (N, n) positions and measured velocities.
+        q, v: (N, n) positions [rad or m] and measured velocities [rad/s or m/s].
         segment: (N,) number of the gap-free segment of each sample.
     """
     position = np.array(q)

@@ -246,7 +246,8 @@ class _LagFit:
 
         Args:
             lags: (n,) lags of the joints, as indices of `SHIFTS`.
-            spread: (n,) standard deviations of the joints' torques, to which residuals are relative.
+            spread: (n,) standard deviations of the joints' torques over time [N m or N], to which residuals are
+                relative.
         """
         deviation = self.residual(lags).std(axis=1) / self.weight
         relative = deviation / np.maximum(spread, 1e-12)

@@ -53,7 +53,7 @@ class Reference:
         """Return position, velocity, feedforward torque and acceleration as one array (4, N, n).
 
         Args:
-            ahead: (N, n) feedforward torques; None: zero.
+            ahead: (N, n) feedforward torques [N m or N]; None: zero.
         """
         if ahead is None:
             torque = np.zeros_like(self.q)
@@ -298,7 +298,7 @@ def _joint(
     """Return the ARX coefficients a (na,), b (nb + 1,) of one joint, by two-stage least squares.
 
     Args:
-        error, tau: (N,) low-passed position error and torque.
+        error, tau: (N,) low-passed position error [rad or m] and torque [N m or N].
         basis: (N, k) orthonormal basis of the instruments.
         orders: na, nb of the ARX model.
     """
@@ -352,7 +352,7 @@ def _explained(error: np.ndarray, tau: np.ndarray, gains: np.ndarray, rate: floa
     """Return the share [%] of a joint's low-passed torque (N,) that the gains kp, kd, ki (3,) explain.
 
     Args:
-        error, tau: (N,) position error and torque of the joint, low-passed.
+        error, tau: (N,) low-passed position error [rad or m] and torque [N m or N] of the joint.
         gains: (3,) kp, kd, ki.
         rate: sampling rate [Hz].
         band: cut-off of the low-pass [Hz].

@@ -85,7 +85,7 @@ class Instruments:
 
         Args:
             fit: the result of `iv`.
-            std: (g,) standard deviations of the groups that `iv` used; None: equal.
+            std: (g,) noise standard deviations of the groups of rows that `iv` used, in units of y; None: equal.
         """
         p = len(self.names)
         sigma = np.ones(self.data.groups) if std is None else std
@@ -155,7 +155,8 @@ def iv(problem: Instruments, std: np.ndarray | None = None, inflation: float = 1
 
     Args:
         problem: R factors of [Z W y].
-        std: (g,) standard deviations of the groups, usually those of the weighted least squares of W; None: equal.
+        std: (g,) noise standard deviations σ_g of the groups of rows, in units of y, usually those of the weighted
+            least squares of W; None: equal.
         inflation: variance inflation >= 1 of all groups, explained in the module `linear`.
 
     Raises:
@@ -207,7 +208,7 @@ def strength(problem: Instruments, std: np.ndarray | None = None) -> InstrumentS
 
     Args:
         problem: R factors of [Z W y].
-        std: (g,) standard deviations of the groups; None: equal.
+        std: (g,) noise standard deviations of the groups of rows, in units of y; None: equal.
     """
     p = len(problem.names)
     rows = int(problem.data.rows.sum())
@@ -240,9 +241,10 @@ def exogeneity(problem: Instruments, std: np.ndarray | None = None, inflation: f
 
     Args:
         problem: R factors of [Z W y].
-        std: (g,) standard deviations of the groups; None: equal, which gives false alarms for groups of different
-            noise.
-        inflation: variance inflation >= 1; at 1, autocorrelated residuals give false alarms.
+        std: (g,) noise standard deviations of the groups of rows, in units of y; None: equal, which gives false alarms
+            for groups of different noise.
+        inflation: variance inflation >= 1, the number of rows that count as one; at 1, autocorrelated residuals give
+            false alarms.
 
     Raises:
         CalibError: if the instruments equal the columns, or there are too few rows.
@@ -285,7 +287,7 @@ def projected(problem: Instruments, std: np.ndarray | None = None) -> np.ndarray
 
     Args:
         problem: R factors of [Z W y].
-        std: (g,) standard deviations of the groups; None: equal.
+        std: (g,) noise standard deviations of the groups of rows, in units of y; None: equal.
     """
     return _projected(combine(problem.data, std), problem.names)
 
@@ -304,7 +306,7 @@ def by_free_instruments(
 
     Args:
         problem: R factors of [Z W y].
-        std: (g,) standard deviations of the groups.
+        std: (g,) noise standard deviations of the groups of rows, in units of y.
         constrained: (p,) a point x_c that satisfies the constraints.
         normals: A (k, p), normals of the constraints.
     """

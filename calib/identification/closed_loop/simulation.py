@@ -155,10 +155,10 @@ class SimulatedRun:
 
     Attributes:
         t: (M,) sample times [s].
-        q, v, a: (M, n) true motion.
-        measured: (M, n) positions measured by the encoders.
-        tau: (M, n) torques as recorded, with `Sensing.sigma_tau`.
-        torque: (M, n) torques that acted on the joints.
+        q, v, a: (M, n) true motion [rad or m, and per s, per s²].
+        measured: (M, n) positions measured by the encoders [rad or m].
+        tau: (M, n) torques as recorded, with noise of `Sensing.sigma_tau` [N m or N].
+        torque: (M, n) torques that acted on the joints [N m or N].
     """
 
     t: np.ndarray

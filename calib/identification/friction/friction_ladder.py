@@ -108,7 +108,7 @@ class FrictionSelection:
         """Return the selection without the terms that the final fit switched off.
 
         Args:
-            sigma: (k,) standard deviations of the selected terms in the final fit; zero if switched off.
+            sigma: (k,) standard deviations of the selected terms' parameters in the final fit; zero if switched off.
         """
         off = []
         joints = {}
@@ -143,7 +143,7 @@ class FrictionCandidates:
         rows: rows of these recordings in the base columns and standard drive terms, with time blocks numbered.
         loads: torques transmitted by the gears of each case (N, n), from a first fit; None if no term depends on them.
         decimator: filter of the rows.
-        std, inflation: (rows,) standard deviation and variance inflation of the first fit's residuals.
+        std, inflation: (rows,) standard deviation [N m or N] and variance inflation of the first fit's residuals.
         v0: (n,) smoothing of the Coulomb sign [rad/s or m/s].
         linear: (n,) whether each joint is prismatic.
         apart: indices of rows with a different unit, excluded from totals.

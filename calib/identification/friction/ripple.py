@@ -132,7 +132,7 @@ class GearTravel:
     """Motion of the gears in the recordings.
 
     Attributes:
-        q, v: (N, n) positions and velocities.
+        q, v: (N, n) positions [rad or m] and velocities [per s].
         block: (N,) time block of each sample.
         moving: joints, from 0, that move enough.
     """
@@ -190,7 +190,7 @@ def find_turns(track: GearTravel, residuals: np.ndarray) -> dict[int, int]:
 
     Args:
         track: motion of the gears.
-        residuals: (N, n) high-frequency parts of the unexplained torques.
+        residuals: (N, n) high-frequency parts of the unexplained torques [N m or N].
     """
     scores: dict[int, np.ndarray] = {}
     total = np.zeros(len(TURNS))
@@ -221,7 +221,7 @@ def find(joint: int, track: GearTravel, residual: np.ndarray, turns: Mapping[int
     Args:
         joint: joint, from 0.
         track: motion of the gears.
-        residual: (N,) unexplained torque, without its slow part, at the samples of `track`.
+        residual: (N,) unexplained torque [N m or N], without its slow part, at the samples of `track`.
         turns: motor turns per turn of each gear, from `find_turns`.
     """
     if not residual.any():

@@ -182,7 +182,7 @@ def scaled_tls(pooled: Triangles, std: np.ndarray, exact: np.ndarray, inflation:
 
     Args:
         pooled: R factors, one group per torque row.
-        std: (rows,) standard deviations of the residuals.
+        std: (rows,) standard deviations of the residuals [N m or N].
         exact: (p,) mask of columns without noise: ones (offsets) and signs.
         inflation: (rows,) variance inflation of the residuals; None: every row is independent.
     """

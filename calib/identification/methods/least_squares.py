@@ -80,7 +80,7 @@ def _regularised(
     Args:
         problem: data and settings.
         prior: prior of the base parameters; None: no prior.
-        std, inflation: (rows,) standard deviations and variance inflations of the rows.
+        std, inflation: (rows,) noise standard deviation [N m or N] and variance inflation of each torque row.
         tempering: factor by which the prior's weight is increased.
 
     Returns:
@@ -146,7 +146,7 @@ def _braking(problem: IdentificationProblem, free: np.ndarray, std: np.ndarray, 
     Args:
         problem: data and settings.
         free: (p,) unconstrained estimate.
-        std: (rows,) standard deviations, including variance inflation.
+        std: (rows,) noise standard deviation of each torque row [N m or N], times the root of its variance inflation.
         prior_rows: (k, p) whitened rows of prior and ridges.
     """
     terms, pooled = problem.terms, problem.pooled

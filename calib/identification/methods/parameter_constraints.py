@@ -264,7 +264,7 @@ def hold(
         fit: the unconstrained estimate.
         factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of its least-squares problem.
         data: R factors of the rows whose residuals give the noise, one group per torque row.
-        std: (g,) standard deviations of the groups.
+        std: (g,) noise standard deviations of the groups, in units of y.
         constraints: the constraints.
         stated_noise: whether `std` is the noise from which the covariance follows; otherwise σ² of the constrained
             estimate's residuals.

@@ -135,7 +135,7 @@ class Samples:
     Attributes:
         names, units: names and units of the p parameters.
         matrix: (N, n, p) regressors.
-        target: (N, n) torques.
+        target: (N, n) torques [N m or N].
         present: (N, n) mask of rows in use; rows of slow joints may be unused in single samples.
     """
 
@@ -185,7 +185,7 @@ def stack(
 
     Args:
         matrix: (N, n, p) regressors.
-        target: (N, n) torques.
+        target: (N, n) torques [N m or N].
         present: (N, n) mask of rows in use; None: all.
         names, units: names and units of the p parameters; None: x1, x2, … without units.
 
@@ -401,7 +401,7 @@ def _share_left(data: Samples, std: np.ndarray) -> np.ndarray:
 
     Args:
         data: the samples.
-        std: (n,) standard deviations of the joints' residuals.
+        std: (n,) standard deviations of the joints' residuals [N m or N].
     """
     triangles = _triangles(data, np.ones(data.target.shape))
     inverse = solve_triangle(combine(triangles, std), data.names)[1]

@@ -80,7 +80,7 @@ def column_noise(states: NoisyStates, std: np.ndarray) -> np.ndarray:
 
     Args:
         states: all samples with noisy states; ΔW_k is the error of the regressor of sample k.
-        std: (rows,) standard deviations of the torques.
+        std: (rows,) standard deviations of the torques' noise [N m or N].
     """
     p = states.matrix.shape[2]
     total = np.zeros((p, p))

@@ -130,7 +130,7 @@ class NoisyStates:
         columns: (p,) indices of the model's columns.
         smooth: (p,) mask of columns that can be differentiated by q, v and a.
         matrix: (M, n, p) observation matrix.
-        target: (M, n) torques.
+        target: (M, n) torques [N m or N].
         present: (M, n) mask of rows in use.
         parts: states of each recording.
     """

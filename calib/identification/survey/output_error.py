@@ -358,7 +358,7 @@ def _packed(
         plain: the least-squares estimate, for names and units.
         values: (p,) parameters.
         residual, slopes: (M, r) residuals and (M, r, p) Jacobian.
-        std: (r,) standard deviations.
+        std: (r,) standard deviations of the residuals [rad, m, N m or N].
 
     Raises:
         Unidentifiable: if the simulated motion does not distinguish parameters.

@@ -183,7 +183,7 @@ class Stepper:
         Args:
             parameters: (K, p) parameters of the robot for each state.
             q, v: (K, n) states.
-            tau: (n,) torque, held for the period.
+            tau: (n,) drive torques [N m or N], held for the period.
             period: duration [s].
 
         Raises:
@@ -209,7 +209,7 @@ class Stepper:
         Args:
             parameters: (p,) parameters of the robot.
             q, v: (n,) state.
-            tau: (n,) torque, held for the period.
+            tau: (n,) drive torques [N m or N], held for the period.
             period: duration [s].
             columns: number c of parameters in the Jacobian.
 

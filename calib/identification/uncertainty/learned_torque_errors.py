@@ -174,7 +174,7 @@ class _Samples:
 
     Attributes:
         states: (3, M, n) q, v and a.
-        torque, error: (M, rows) recorded torque, and prediction error of the final model.
+        torque, error: (M, rows) recorded torque, and prediction error of the final model [N m or N].
         matrix: (M, rows, p) filtered columns.
         block: (M,) number of the time block; -1 for samples that are not used.
         trajectory, trajectory_block: (K, 2 n) q and v at up to the full rate, and their time blocks (K,).
@@ -351,7 +351,7 @@ def _standing_speeds(identification: Identification, friction: np.ndarray) -> np
 
     Args:
         identification: the model, with the width of Coulomb's sign.
-        friction: (rows,) Coulomb friction of the torque rows.
+        friction: (rows,) Coulomb friction of the torque rows [N m or N].
     """
     n = identification.dynamics.model.n
     if not friction.any():
@@ -370,7 +370,7 @@ def _hold_out(
         identification: the model and its rows.
         samples: motion and residuals.
         run: numbers of the held-out blocks.
-        standing_speeds: (n,) speeds below which a joint counts as at rest.
+        standing_speeds: (n,) speeds below which a joint counts as at rest [rad/s or m/s].
     """
     block_count = samples.triangles.groups // len(identification.fitted.std)
     remaining = [block for block in range(block_count) if block not in run]
@@ -397,7 +397,7 @@ def _rest_floors(folds: Sequence[_HeldOut], friction: np.ndarray, weights: np.nd
 
     Args:
         folds: held-out runs.
-        friction: (rows,) Coulomb friction.
+        friction: (rows,) Coulomb friction [N m or N].
         weights: (rows, 3) κ, v and u in motion.
     """
     expected = weights[:, 1] + friction**2 / 3.0

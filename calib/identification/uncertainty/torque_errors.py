@@ -364,7 +364,7 @@ def intervals(errors: TorqueErrorModel, dynamics: Dynamics, case: Case, predicte
         errors: model of the errors.
         dynamics: the model that predicts.
         case: the recording.
-        predicted: (N, rows) predicted torques.
+        predicted: (N, rows) predicted torques [N m or N].
     """
     motion = case.motion
     count = len(motion)
