@@ -72,7 +72,7 @@ def design_of(pool: Pool, members: tuple[int, ...]) -> Design:
 
 
 def with_added(pool: Pool, design: Design, i: int) -> Design:
-    """Return the design after adding candidate number i.
+    """Return the design after adding the candidate with index i, which must not be a member.
 
     Args:
         pool: the candidates from which the design is chosen.

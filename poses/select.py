@@ -67,7 +67,7 @@ class Selection:
 
     Attributes:
         q: (m, n) joint values [rad or m]; None where the candidates were given without joint values.
-        indices: (m,) numbers of the chosen candidates, rising; None for methods whose poses are not candidates.
+        indices: (m,) indices of the chosen candidates, rising; None for methods whose poses are not candidates.
         index: name of the index the search improved.
         value: value of that index for the chosen poses together with the poses measured before (m counts both).
         history: values of the index as the search improved it; the last is `value`.

@@ -209,7 +209,7 @@ def coupled(
     Args:
         first, second: the coupled joints, from 0.
         v0: smoothing of the Coulomb sign [rad/s].
-        label: suffix of the parameters' names; None: the number of the second joint, from 1.
+        label: suffix of the parameters' names; None: that of the second joint, counted from 1.
         weight: weight of the second joint.
     """
     if label is None:

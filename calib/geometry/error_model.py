@@ -457,8 +457,9 @@ class _Rows:
     def left_out(self, folds: Folds, levers: np.ndarray) -> Iterator[np.ndarray]:
         """Yield the errors on the held-out rows of each fold, as an array (rows, 5).
 
-        The columns are |e|² [m²], trace J Σ Jᵀ [m²], squared distances from the fitted poses and from the joints'
-        ranges [m²] (as of `_distances`), and the pose number.
+        The columns are |e|² [m²] of the position error e, its variance trace J Σ Jᵀ [m²] due to the parameters (J
+        Jacobian, Σ their covariance), squared distances from the fitted poses and from the joints' ranges [m²] (as of
+        `_distances`), and the index of the pose.
 
         Args:
             folds: the partition of the rows.

@@ -153,7 +153,7 @@ def place_pose(arm: np.ndarray, measured: np.ndarray) -> Placements:
 
 
 def by_orientations(arm: np.ndarray, measured: np.ndarray) -> Placements:
-    """Return S and X by Shah's method from the orientations of the poses.
+    """Return station S and tool X (4, 4) by Shah's method from the orientations of the poses.
 
     The result is accurate if the poses rotate about two axes by much more than the errors of the orientations.
 

@@ -135,6 +135,8 @@ def identify_gains(
 ) -> DriveGains:
     """Return the drive gains estimated from R factors of [W P | i], one group per joint.
 
+    W are the columns of the robot's base parameters, P those of the payload's parameters, i the currents.
+
     Args:
         currents: R factors with the columns of a model with payload, and the currents as target.
         payload: parameters of known value (a payload's mass, its centre of mass), in SI units.
@@ -232,7 +234,8 @@ def identify_relative_gains(data: Triangles, joints: int, inflation: np.ndarray,
     that diverged most counts as not identified.
 
     Args:
-        data: R factors of [W i] by time block and joint, group = block · joints + joint.
+        data: R factors of [W i] (columns of the base parameters, and currents) by time block and joint, group = block ·
+            joints + joint.
         joints: number of joints.
         inflation: (joints,) variance inflation, i.e. number of rows that count as one.
         reference: joint whose gain is 1, from 0.

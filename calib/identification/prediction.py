@@ -181,7 +181,7 @@ class Score:
 
 
 def relative_error_sigma(measured: np.ndarray, predicted: np.ndarray) -> float:
-    """Return the standard error of 100 ‖τ - τ̂‖ / ‖τ‖ [%], by a jackknife over blocks of time.
+    """Return the standard error of 100 ‖τ - τ̂‖ / ‖τ‖ [%] (measured τ, predicted τ̂), by a jackknife over time blocks.
 
     Blocks are used because residuals are autocorrelated (Efron and Tibshirani 1993, eq. 11.5, with blocks instead of
     samples: Künsch 1989); ten blocks are our choice.

@@ -133,7 +133,7 @@ class Prior:
 
     @property
     def rows(self) -> np.ndarray:
-        """The prior as whitened rows (b, b + 1) of [W y]."""
+        """The prior as whitened rows (b, b + 1), to be appended to the rows [W y] of observation matrix and torques."""
         unit = np.sqrt(np.diag(self.covariance))
         lower = np.linalg.cholesky(self.covariance / np.outer(unit, unit))
         inverse = scipy.linalg.solve_triangular(lower, np.diag(1.0 / unit), lower=True)

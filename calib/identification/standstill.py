@@ -409,14 +409,14 @@ def left_out_error(
 ) -> float:
     """Return Σ (τ - τ̂)² of the rows in motion, each time block being predicted by a fit of the other blocks.
 
-    Torque errors are not weighted, as in the errors shown to users. If rows were weighted by their residuals, a joint
-    whose torques are fitted by wrong parameters would dominate.
+    τ are measured and τ̂ predicted torques. Their errors are not weighted, as in the errors shown to users. If rows
+    were weighted by their residuals, a joint whose torques are fitted by wrong parameters would dominate.
 
     Args:
         training: rows with the tested treatment of standstills.
         marked: the same samples with their standstills marked.
         std, inflation: (rows,) standard deviation [N m or N] and variance inflation of the residuals.
-        prior: whitened rows (k, p + 1) of [W y]; None without a prior.
+        prior: (k, p + 1) whitened rows of the prior, to be appended to the rows [W y]; None without a prior.
         apart: indices of torque rows in a different unit, excluded from the sum.
     """
     rows = training[0].target.shape[1]

@@ -43,7 +43,7 @@ class Regimes:
 def regimes(all_rows: Sequence[ObservationRows], cases: Sequence[Case], decimator: Decimator) -> Regimes:
     """Return the products [W y]ᵀ[W y] by range of motion: fast, accelerated, near each end of travel, each direction.
 
-    Standstills are in no range, since friction at rest is undetermined.
+    W is the observation matrix, y are the torques. Standstills are in no range, since friction at rest is undetermined.
 
     Args:
         all_rows: rows of all recordings.
@@ -245,7 +245,7 @@ def estimate(
         data: R factors, one group per torque row.
         std, inflation: (rows,) standard deviation [N m or N] and variance inflation of the residuals.
         group: (p,) ridge group of each column; -1 for none.
-        prior: (k, p + 1) whitened rows of [W y] of a prior; None without one.
+        prior: (k, p + 1) whitened rows of a prior, to be appended to the rows [W y]; None without one.
     """
     weight = 1.0 / (std * np.sqrt(inflation))
     weighted = data.factors * weight[:, None, None]

@@ -30,7 +30,7 @@ class Folds:
     Attributes:
         kind: ``stations``, ``files``, ``fixtures`` or ``regions``; on request ``random`` or ``poses`` (leave-one-out).
         count: number of folds.
-        members: for each block, (m,) fold number of each row.
+        members: for each block, (m,) index of each row's fold, from 0.
         blind: names of stations or files that are not held out as a whole, since the other rows do not determine their
             tool.
     """

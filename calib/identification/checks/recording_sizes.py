@@ -94,10 +94,10 @@ class ClockRatio:
 def clock_ratio(samples: MotionSamples, chain: Chain) -> ClockRatio | None:
     """Return the ratio of inertias to masses; None if motion or arm do not identify both.
 
-    Torques are modelled as τ = α τ_rods + free, twice. In the first fit α scales the rods' torques of motion, and any
-    gravity torque is allowed; in the second, α scales the rods' gravity torques, and any torque of motion is allowed.
-    Both fits include free drives. If the description has masses, the ratio relative to the described bodies is returned
-    if it is nearer to 1.
+    Torques τ are modelled as α τ_rods + free, twice: α is a factor of τ_rods, the torques of rods between the joints.
+    In the first fit α scales the rods' torques of motion, and any gravity torque is allowed; in the second, α scales
+    the rods' gravity torques, and any torque of motion is allowed. Both fits include free drives. If the description
+    has masses, the ratio relative to the described bodies is returned if it is nearer to 1.
 
     Args:
         samples: samples of a recording.

@@ -126,8 +126,11 @@ def computed_torque(
 ) -> LoopController:
     """Return a computed-torque controller with error dynamics ë + 2 ζ ω ė + ω² e = 0 if its model is exact.
 
+    e is the position error.
+
     Args:
-        model: (10 B,) standard parameters of the controller's model; inertias and friction of the drives are not in it.
+        model: (10 B,) standard parameters of the controller's model of B bodies; inertias and friction of the drives
+            are not in it.
         frequency: ω of the error dynamics [rad/s].
         damping: damping ratio ζ.
         n: number of joints.

@@ -420,8 +420,8 @@ def _fed_forward(
 def simulated_case(case: Case, run: SimulatedRun, loop: Loop) -> Case:
     """Return the case with the simulated motion at the recorded times, filtered like the recorded motion.
 
-    Low-pass and differences round off reversals of a motion. Since both motions are filtered equally, this affects W
-    and Z equally, so that they differ by noise only.
+    Low-pass and differences round off reversals of a motion. Since both motions are filtered equally, this affects the
+    observation matrix W and the instruments Z equally, so that they differ by noise only.
 
     Args:
         case: a gap-free part of a recording.

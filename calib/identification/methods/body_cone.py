@@ -52,6 +52,8 @@ class BodyCone(Frozen):
     def touching(self, factor: np.ndarray, matrix: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> _Plane | None:
         """Return the cone's tangent plane at argmin ½ ‖R β - z‖² under lower <= A β <= upper and the cone.
 
+        β (p,) are the parameters of the columns, base parameters first.
+
         The result is None if the cone is not binding.
 
         Args:

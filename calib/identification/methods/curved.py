@@ -240,7 +240,8 @@ def tangents(
 
     Args:
         curved: the m constraints.
-        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ].
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem min ‖R β - z‖² in the parameters
+            β.
         start: (p,) β that satisfies the other constraints.
         solve: function that returns the optimum of a problem with p + m unknowns b, given its triangle (p + m + 1, p +
             m + 1) and further inequalities rows (2 m, p + m) b >= lower (2 m,), under the other constraints.

@@ -27,12 +27,12 @@ def tls(
 ) -> LinearFit:
     """Estimate x of (W - ΔW) x = y - Δy with the smallest Σ (ΔW_kc / noise_c)² + (Δy_k / noise_y)², by TLS.
 
-    With exact columns first, [W y] = Q [R11 R12; 0 R22]. The right singular vector of R22 / noise for the smallest
-    singular value gives the noisy components of [x; -1], and back substitution the exact ones (Golub, Hoffman & Stewart
-    1987; Van Huffel & Vandewalle 1991, section 3.6). The noise level is σ² = s_min² / (r - p). The covariance (Fuller
-    1987, theorem 2.3.2, normal noise) is V = M⁻¹ σ_vv + r M⁻¹ (Σ_uu σ_vv - Σ_uv Σ_uvᵀ) M⁻¹ with M = WᵀW - r Σ_uu, Σ_uv
-    = -Σ_uu x and σ_vv = σ² (noise_y² + Σ noise_c² x_c²). For correlated rows with variance inflations τ_g it becomes V
-    + σ_vv M⁻¹ (Σ_g (τ_g - 1) W_gᵀ W_g) M⁻¹.
+    With exact columns first, the QR of [W y] is Q [R11 R12; 0 R22]. The right singular vector of R22 / noise for the
+    smallest singular value gives the noisy components of [x; -1], and back substitution the exact ones (Golub, Hoffman
+    & Stewart 1987; Van Huffel & Vandewalle 1991, section 3.6). The noise level is σ² = s_min² / (r - p). The covariance
+    (Fuller 1987, theorem 2.3.2, normal noise) is V = M⁻¹ σ_vv + r M⁻¹ (Σ_uu σ_vv - Σ_uv Σ_uvᵀ) M⁻¹ with M = WᵀW - r
+    Σ_uu, Σ_uv = -Σ_uu x and σ_vv = σ² (noise_y² + Σ noise_c² x_c²). For correlated rows with variance inflations τ_g it
+    becomes V + σ_vv M⁻¹ (Σ_g (τ_g - 1) W_gᵀ W_g) M⁻¹.
 
     Args:
         data: R factors of W and y.

@@ -69,7 +69,7 @@ class Constraints(Frozen):
         """Return argmin ½ ‖R β - z‖² under these constraints, computed by `constrained.within`.
 
         Args:
-            factor: (p + 1, p + 1) upper triangle [R z; 0 ρ].
+            factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of the least-squares problem in the parameters β.
             free: (p,) unconstrained β, which gives the scale of M(q); None: the least-squares solution of the triangle.
 
         Raises:
@@ -90,7 +90,7 @@ class Constraints(Frozen):
         return "; ".join(self.names) or "them"
 
     def raised(self) -> Constraints | None:
-        """Return the constraints with a three times larger bound on M(q)'s smallest eigenvalue.
+        """Return the constraints with a three times larger bound on the inertia matrix M(q)'s smallest eigenvalue.
 
         The result is None if the bound would exceed `MAX_EIGENVALUE`. A robot may have a positive definite inertia
         matrix, but so little inertia in some direction that a sampled controller cannot stabilise it.
@@ -262,7 +262,7 @@ def hold(
 
     Args:
         fit: the unconstrained estimate.
-        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of its least-squares problem.
+        factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of its least-squares problem min ‖R β - z‖².
         data: R factors of the rows whose residuals give the noise, one group per torque row.
         std: (g,) noise standard deviations of the groups, in units of y.
         constraints: the constraints.

@@ -87,9 +87,10 @@ def consistency(joints: int) -> float:
 def variance_factor(size: np.ndarray, joints: np.ndarray) -> float:
     """Return the factor v of the weighted fit's covariance cov(x) = v (Σ w_k W_kᵀ S⁻¹ W_k)⁻¹.
 
-    cov(x) = a / b² (Σ W_kᵀ S⁻¹ W_k)⁻¹ with a = mean w² d² / n and b = mean(w + w' d / n) over the samples (Huber &
-    Ronchetti 2009, section 7.6), and the sum over all samples is the weighted sum over mean w. The step of w at the
-    gate is neglected, an error of a few per mille.
+    W_k (n, p) is the regressor of sample k, S (n, n) the noise covariance, w_k the weight. cov(x) = a / b² (Σ W_kᵀ S⁻¹
+    W_k)⁻¹ with a = mean w² d² / n and b = mean(w + w' d / n) over the samples (Huber & Ronchetti 2009, section 7.6),
+    and the sum over all samples is the weighted sum over mean w. The step of w at the gate is neglected, an error of a
+    few per mille.
 
     Args:
         size: (N,) Mahalanobis sizes.
@@ -213,16 +214,16 @@ def stack(
 def irls(data: Samples, inflation: float = 1.0, solve: Callable[[np.ndarray], np.ndarray] | None = None) -> SampleFit:
     """Estimate x and S by iteratively reweighted least squares over whole samples (Maronna 1976), with a gate.
 
-    S, weights and x are computed in turn until x changes by less than 1e-4 of its standard deviation. The iteration
-    starts from a Cauchy fit of single rows with median-based standard deviations, because outliers would increase a
-    covariance estimated from all samples and so remain hidden. The covariance of x is that of the M-estimator,
-    `variance_factor`.
+    x (p,) are the parameters, S (n, n) is the noise covariance across joints. S, weights and x are computed in turn
+    until x changes by less than 1e-4 of its standard deviation. The iteration starts from a Cauchy fit of single rows
+    with median-based standard deviations, because outliers would increase a covariance estimated from all samples and
+    so remain hidden. The covariance of x is that of the M-estimator, `variance_factor`.
 
     Args:
         data: the samples.
         inflation: variance inflation >= 1 of all joints, explained in the module `linear`.
-        solve: function of a triangle [R z; 0 ρ] that returns x (p,), e.g. under constraints, which the covariance
-            ignores; None: least squares.
+        solve: function of the triangle [R z; 0 ρ] of the weighted least-squares problem that returns x (p,), e.g. under
+            constraints, which the covariance ignores; None: least squares.
 
     Raises:
         NotConverged: if the weights do not converge.

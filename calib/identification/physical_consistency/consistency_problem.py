@@ -212,8 +212,9 @@ def nearest(problem: BodyCost, spared: int | None = None, pull: float = 0.0) -> 
 
     Args:
         problem: data, prior bodies and drive terms.
-        spared: index of a body (or B plus the index of a drive term) that may be inconsistent; None: none may.
-        pull: weight γ of the Euclidean prior; 0: no prior.
+        spared: index of a body (or the number of bodies plus the index of a drive term) that may be inconsistent; None:
+            none may.
+        pull: weight γ of the Euclidean prior towards the prior bodies; 0: no prior.
 
     Raises:
         NotConverged: if Clarabel finds no optimum.

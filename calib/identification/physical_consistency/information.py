@@ -58,7 +58,7 @@ class Information(Frozen):
 
     @property
     def best(self) -> float:
-        """Minimum of ‖R β - z‖² over all β, including physically inconsistent ones."""
+        """Minimum of ‖R β - z‖² (data's rows `factor`) over all β (b,), including physically inconsistent ones."""
         matrix = self.factor[:, :-1]
         target = self.factor[:, -1]
         unit = np.linalg.norm(matrix, axis=0)

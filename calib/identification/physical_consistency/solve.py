@@ -319,7 +319,7 @@ def _descend(problem: BodyCost, gamma: float, values: np.ndarray) -> np.ndarray:
 
 
 def cost(problem: BodyCost, gamma: float, values: np.ndarray) -> float:
-    """Return the cost J(χ) of the equation in the module's docstring; infinite for inconsistent parameters.
+    """Return the cost J(χ), data term plus prior, by the module's docstring; infinite for inconsistent parameters χ.
 
     Args:
         problem: the cost.

@@ -23,11 +23,12 @@ class _GeneralisedTLS(Method):
     def estimate(self, problem: IdentificationProblem) -> MethodEstimate:
         """Return x of Σ_k (W_kᵀ Ω⁻¹ W_k - C_k) x = Σ_k W_kᵀ Ω⁻¹ y_k.
 
-        C_k = E[ΔW_kᵀ Ω⁻¹ ΔW_k] = Σ_i D_kiᵀ G D_ki / σ_i², where D_ki are the derivatives of row i of W by q, v, a, and
-        G is the covariance of their noise (`maximum_likelihood.noise_of_states`). x is the smallest generalised
-        singular vector of [W y] for the torque noise of the residuals (Van Huffel & Vandewalle 1989; Fuller 1987,
-        section 2.2). The covariance is that of theorem 2.2.1 there, with autocorrelated residuals. The method `ml`
-        weights each sample by its own noise and is more accurate if that noise is large.
+        W_k and y_k are regressor and torques of sample k, Ω is the covariance of the torque noise. C_k = E[ΔW_kᵀ Ω⁻¹
+        ΔW_k] = Σ_i D_kiᵀ G D_ki / σ_i², where D_ki are the derivatives of row i of W by q, v, a, and G is the
+        covariance of their noise (`maximum_likelihood.noise_of_states`). x is the smallest generalised singular vector
+        of [W y] for the torque noise of the residuals (Van Huffel & Vandewalle 1989; Fuller 1987, section 2.2). The
+        covariance is that of theorem 2.2.1 there, with autocorrelated residuals. The method `ml` weights each sample by
+        its own noise and is more accurate if that noise is large.
 
         Args:
             problem: data and settings.

@@ -146,7 +146,8 @@ def linearly_predicted(before: Belief, mean: np.ndarray, slopes: np.ndarray, noi
 def corrected(before: Belief, measured: np.ndarray, rows: int, std: np.ndarray) -> tuple[Belief, float]:
     """Return the belief corrected by a measurement of its first `rows` components, and the innovation's size.
 
-    The size is eᵀ (H P Hᵀ + R)⁻¹ e for innovation e; its mean is `rows` if the filter's noise levels are correct.
+    The size is eᵀ (H P Hᵀ + R)⁻¹ e for the innovation e (measured minus expected), with H P Hᵀ the covariance of the
+    measured components before and R = diag(std²); its mean is `rows` if the filter's noise levels are correct.
 
     Args:
         before: belief before the measurement.

@@ -342,7 +342,9 @@ def _step(task: NoisyStates, values: np.ndarray, noise: np.ndarray) -> _Round:
 
 
 def changed(task: NoisyStates, part: _Recording, error: np.ndarray) -> np.ndarray:
-    """Return W(x + error) - W(x) (M, n, p) for errors (M, 3, n) of the states; zero in columns without derivative.
+    """Return the change W(x + error) - W(x) (M, n, p) of the regressor W for errors of the states x.
+
+    It is zero in columns without derivative.
 
     Args:
         task: all samples.

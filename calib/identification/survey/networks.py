@@ -61,9 +61,10 @@ def hopfield(
 
         u̇ = -Wᵀ W x + Wᵀ y,    x = α tanh(u / 5)
 
-    by Euler steps (Tank & Hopfield 1986; Atencia, Joya & Sandoval 2004; Leboutet et al. 2021). At rest x is the
-    ordinary least-squares estimate, if no neuron is saturated. The survey tunes the step for each robot, 3e-8 to 1e-6;
-    here it is half of the largest stable step, times `rate` (our choice).
+    by Euler steps, with W (r, p) the observation matrix and y (r,) the torques (Tank & Hopfield 1986; Atencia, Joya &
+    Sandoval 2004; Leboutet et al. 2021). At rest x is the ordinary least-squares estimate, if no neuron is saturated.
+    The survey tunes the step for each robot, 3e-8 to 1e-6; here it is half of the largest stable step, times `rate`
+    (our choice).
 
     Args:
         factor: (p + 1, p + 1) upper triangle [R z; 0 ρ] of [W y], not weighted.

@@ -223,7 +223,7 @@ class GeometryUncertainty(Frozen):
 
     @property
     def covariance(self) -> np.ndarray:
-        """Total covariance (p, p): Σ_torque + S Σ_geometry Sᵀ."""
+        """Total covariance (p, p): Σ_torque (`torque`) + S Σ_geometry Sᵀ (`geometry`), with S the sensitivity."""
         return np.asarray(self.torque) if self.geometry is None else self.torque + self.geometry
 
     @property
@@ -337,8 +337,8 @@ def solve_sensitivity(
     Args:
         identification: the model and its rows.
         cases: its training data.
-        differences: function of a case, a slice of its samples, R⁻¹ (y - W φ) and the decimator that returns ∂(W φ -
-            y)/∂g (M, rows, K) and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K).
+        differences: function of a case, a slice of its samples, R⁻¹ (y - W φ) (residuals of the estimate φ over their
+            variances R) and the decimator that returns ∂(W φ - y)/∂g (M, rows, K) and (∂W/∂g)ᵀ R⁻¹ (y - W φ) (b, K).
         samples: largest number of samples at the full rate; longer recordings are represented by pieces.
         progress: function that is called with a short text at each part; None: not called.
     """
@@ -607,7 +607,8 @@ def deflection_sensitivity(found: Identification, robot: CalibratedChain, cases:
 
         dφ/dc = -(Wᵀ R⁻¹ W)⁻¹ Wᵀ R⁻¹ Σ_s ∂τ/∂s b_s,    s one of q, v, a of the joint, b_s the basis or its derivative
 
-    as in `sensitivity`, but without the part that is proportional to the residual.
+    with W the observation matrix, R the variances of its rows, τ the torques; as in `sensitivity`, but without the part
+    that is proportional to the residual.
 
     Args:
         found: the identification.
