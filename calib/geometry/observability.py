@@ -47,7 +47,7 @@ PLACES = {"station": "the placement of the instrument", "tool": "the mounting of
 
 
 def unidentified(fit: GeometricFit) -> list[Finding]:
-    """Return findings on the parameters and placements that a fit's poses do not identify, and on the rank."""
+    """Return findings on the rank, and on the parameters and placements that the poses of `fit` do not identify."""
     split = fit.split
     if split is None:
         return _loose(fit)
@@ -62,7 +62,12 @@ def unidentified(fit: GeometricFit) -> list[Finding]:
 
 
 def _merged(fit: GeometricFit, split: ColumnSplit) -> list[Finding]:
-    """Return findings on arm parameters that depend linearly on other parameters, grouped by these other parameters."""
+    """Return findings on arm parameters that depend linearly on other parameters, grouped by these other parameters.
+
+    Args:
+        fit: the fit.
+        split: its candidate parameters, split into base parameters and dependent ones.
+    """
     table = layout(fit.start)
     # per group: what they merge with, and their names
     groups: dict[object, tuple[list[str], list[str]]] = {}
@@ -91,7 +96,7 @@ def _merged(fit: GeometricFit, split: ColumnSplit) -> list[Finding]:
 
 
 def _at_nominal(fit: GeometricFit) -> list[Finding]:
-    """Return a finding on base parameters of the arm that the data determine hardly better than the prior does."""
+    """Return a finding on base parameters of the arm in `fit` that the data determine hardly better than the prior."""
     if fit.prior is None:
         return []
     table = layout(fit.start)
@@ -110,7 +115,11 @@ def _at_nominal(fit: GeometricFit) -> list[Finding]:
 
 
 def _loose(fit: GeometricFit) -> list[Finding]:
-    """Return findings on tools whose placement is poorly determined, with the station with which it is correlated."""
+    """Return findings on tools whose placement is poorly determined, with the station with which it is correlated.
+
+    Args:
+        fit: the fit, whose covariance is examined.
+    """
     estimate = fit.estimate
     index = {name: k for k, name in enumerate(estimate.names)}
     findings: list[Finding] = []
@@ -154,6 +163,9 @@ def _orientation_range(fit: GeometricFit) -> float | None:
     """Return the range that contains 95 % of the flange's orientations [deg].
 
     None where no poses were measured by an instrument.
+
+    Args:
+        fit: the fit, whose blocks contain the measured poses.
     """
     q = [block.measured.q for block in fit.blocks if block.measured.has_instrument]
     if not q:
@@ -169,6 +181,11 @@ def observation_matrix(cell: Installation, blocks: Sequence[Block], columns: np.
     Rows are divided by their stated sigmas relative to the sigmas' median. Orientation rows are multiplied by a typical
     length of the arm, which makes them comparable with position rows. If W has more than `MOST_NUMBERS` numbers, the R
     factor of its QR decomposition is returned instead, whose columns have the same linear dependences.
+
+    Args:
+        cell: the installation of arm, stations and tools.
+        blocks: the prepared measurements.
+        columns: (c,) indices in the full parameter vector.
     """
     rows: list[np.ndarray] = []
     for block in blocks:
@@ -191,7 +208,7 @@ def observation_matrix(cell: Installation, blocks: Sequence[Block], columns: np.
 
 
 def _reach(cell: Installation) -> float:
-    """Return a typical length of the arm [m]: the sum of the constant lengths along its chain."""
+    """Return a typical length of the arm in `cell` [m]: the sum of the constant lengths along its chain."""
     lengths = 0.0
     offsets = 0.0
     for element in cell.chain.elements:
@@ -209,6 +226,10 @@ def _preference(cell: Installation, columns: np.ndarray) -> list[np.ndarray]:
     cannot be distinguished from the placements (those before the first joint, the last joint's offset) are then
     represented by the placements, and the arm keeps its nominal values. Rotations are before translations so that, at
     parallel axes, Hayati's β is preferred to an offset along the axes.
+
+    Args:
+        cell: the installation.
+        columns: indices in the full parameter vector; the groups are positions in this array.
     """
     order = (("station", "tool", "optics"), ("offset",), ("rad",), ("m",), ("deflection",))
     return [np.flatnonzero(np.isin(families(cell)[columns], group)) for group in order]
@@ -349,6 +370,10 @@ class TargetJacobian:
 def targets_of(chain: Chain, tools: Sequence[Sequence[float]] = ()) -> Installation:
     """Return the arm with targets at the positions `tools` (3,) [m] in the tip's frame; empty for one target at the
     tip.
+
+    Args:
+        chain: the arm.
+        tools: positions of the targets.
     """
     positions = [np.asarray(tool, dtype=float) for tool in tools] or [np.zeros(3)]
     names = ("tool",)
@@ -397,6 +422,12 @@ def _measured(q: np.ndarray, cell: Installation, number: int, full: bool) -> Pos
     """Return noise-free measurements of target `number` at joint values q (m, n).
 
     Orientations are included if `full`.
+
+    Args:
+        q: (m, n) joint values [rad or m].
+        cell: the installation, whose predictions are the measurements.
+        number: index of the target.
+        full: whether orientations are measured, too.
     """
     poses = see(cell, q, 0, np.full(len(q), number)).poses()
     quaternion = None

@@ -65,7 +65,12 @@ class Sheet:
     suffixes: tuple[str, ...] = SUFFIXES
 
     def fail(self, message: str, column: str | None = None) -> NoReturn:
-        """Raise MeasurementError about the file; with `column`, about that column."""
+        """Raise MeasurementError about the file; with `column`, about that column.
+
+        Args:
+            message: text of the error; the file's name is prepended.
+            column: the file's name of the column; None: the whole file.
+        """
         self.table.fail(message, column)
 
     def find(self, name: str) -> str:
@@ -105,7 +110,11 @@ class Sheet:
         return column.check(np.stack(values, axis=1), self.table, names)
 
     def joints(self, joints: Sequence[str]) -> tuple[np.ndarray, tuple[str, ...]]:
-        """Return joint values (m, n) [rad or m], and the file's names of the joint columns."""
+        """Return joint values (m, n) [rad or m], and the file's names of the joint columns.
+
+        Args:
+            joints: names of the robot's n joints, in the robot's order.
+        """
         names = self.find_joints(joints)
         q = self.numbers(names, Column(tuple(joints), "joint", "joints"))
         if self.options.controller:
@@ -113,7 +122,11 @@ class Sheet:
         return q, names
 
     def check_names(self, joints: Sequence[str]) -> None:
-        """Raise MeasurementError if the options map a column name that the toolkit does not know."""
+        """Raise MeasurementError if the options map a column name that the toolkit does not know.
+
+        Args:
+            joints: names of the robot's joints, which the options may map, too.
+        """
         names = (*OURS, *joints, *(f"q{i + 1}" for i in range(len(joints))))
         for name, heading in self.options.columns.items():
             if name not in names and not _TARGET.fullmatch(name):
@@ -133,6 +146,9 @@ class Sheet:
 
         Accepted are the robot's joint names, ``q_<joint name>``, or ``q1`` to ``qn``; the first of these forms that
         occurs in the file is used.
+
+        Args:
+            joints: names of the robot's joints.
         """
         n, table, mapping = len(joints), self.table, self.options.columns
         numbered = tuple(f"q{i + 1}" for i in range(n))
@@ -156,7 +172,12 @@ class Sheet:
         self.fail(f"{message}. Map them in the options' [columns]")
 
     def _refuse_more_joints(self, columns: Sequence[str], n: int) -> None:
-        """Raise MeasurementError for a table with more numbered joint columns than the robot has joints."""
+        """Raise MeasurementError for a table with more numbered joint columns than the robot has joints.
+
+        Args:
+            columns: the file's names of the joint columns that were found.
+            n: number of the robot's joints.
+        """
         if not all(_NUMBERED_JOINT.fullmatch(name) for name in columns):
             return
         for name in self.table.header:
@@ -197,6 +218,10 @@ class Sheet:
 
     def only_family(self, families: Sequence[tuple[str, ...]], names: Sequence[str]) -> tuple[str, ...]:
         """Return the only family of columns that was found in the file, () if none was.
+
+        Args:
+            families: the file's names of the columns of each family that was found.
+            names: the toolkit's names of a family's columns, for messages.
 
         Raises:
             MeasurementError: several families were found.
@@ -276,6 +301,10 @@ class Layout:
 
 def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
     """Return which columns of a table are read, for a robot with joints of the given names.
+
+    Args:
+        sheet: the table with its options.
+        joints: names of the robot's joints.
 
     Raises:
         MeasurementError: a column is missing, or the options map it to one that the file does not have; the header
@@ -388,6 +417,10 @@ def _check_one_source(sheet: Sheet, position: Sequence[str], orientation: Sequen
 
     The plain columns may be commanded values. Columns count as measured if their name has such a suffix, or if the
     options map them although the file has plain names too.
+
+    Args:
+        sheet: the table with its options.
+        position, orientation: the file's names of the position's and the orientation's columns.
     """
     rotation_names = {4: QUATERNION.names, 9: MATRIX.names}.get(len(orientation))
     if rotation_names is None:
@@ -426,6 +459,10 @@ def _grouped_layout(sheet: Sheet, kind: str, joints: tuple[str, ...]) -> Layout:
 def _find_orientation(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the orientation's columns: four (quaternion), nine (matrix), three (angles), or ().
 
+    Args:
+        sheet: the table with its options.
+        joints: names of the joint columns, which are not angles of an orientation.
+
     Raises:
         MeasurementError: three angles whose convention the options do not define.
     """
@@ -444,6 +481,10 @@ def _angles(sheet: Sheet, joints: Sequence[str]) -> tuple[str, ...]:
     """Return the names of three angle columns, in upper or lower case, that are not joints; () without such columns.
 
     Names of one small letter (a, b, c) count as angles only if the options define the convention of the angles.
+
+    Args:
+        sheet: the table with its options.
+        joints: names of the joint columns, which are not angles of an orientation.
     """
     standard_names = ANGLES[0]
     if any(name in sheet.options.columns for name in standard_names):
@@ -484,6 +525,9 @@ def _find_targets(sheet: Sheet) -> tuple[tuple, tuple, tuple[str, ...]]:
     """Return names of positions and sigmas of each target, and notes.
 
     The targets are the one without a number (x y z) if there is one, otherwise x1 y1 z1, x2 y2 z2, ….
+
+    Args:
+        sheet: the table with its options.
     """
     all_names = (*sheet.table.header, *sheet.options.columns)
     marks = sorted({int(name[1:]) for name in all_names if re.fullmatch(r"[xyz]\d+", name)})

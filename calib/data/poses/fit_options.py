@@ -189,7 +189,12 @@ def parse_options(table: Mapping[str, object], source: str = "options") -> FitOp
 
 
 def check_files(options: FitOptions, paths: Sequence[str | Path]) -> None:
-    """Raise UsageError for a [files] table of a file that is not among `paths`."""
+    """Raise UsageError for a [files] table of a file that is not among `paths`.
+
+    Args:
+        options: options of the fit, with a table [files].
+        paths: the measurement files of the fit.
+    """
     names = [Path(path).name for path in paths]
     for name in options.files:
         if not any(own_table({name: name}, path) for path in paths):

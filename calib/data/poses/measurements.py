@@ -295,7 +295,12 @@ Block = TypeVar("Block", bound=PoseMeasurements)
 
 
 def take(block: Block, index: Sequence[int] | np.ndarray) -> Block:
-    """Return the rows at the indices `index`; groups keep their numbers, so that links stay valid."""
+    """Return the rows at the indices `index`; groups keep their numbers, so that links stay valid.
+
+    Args:
+        block: measurements of one kind.
+        index: row indices, or a mask (m,).
+    """
     index = np.asarray(index)
     rows: dict[str, object] = {}
     for name in block.per_row:

@@ -120,6 +120,10 @@ def labels(table: Table, columns: Sequence[str]) -> tuple[tuple[str, ...], np.nd
     """Return the distinct labels in order of appearance, and the index (m,) of each row's label.
 
     The labels of several columns are joined by ``/``.
+
+    Args:
+        table: the table.
+        columns: names of the columns with labels.
     """
     texts = np.column_stack([np.array(table.texts(name), dtype=object) for name in columns])
     empty = (texts == "") | (texts == "nan")
@@ -132,7 +136,12 @@ def labels(table: Table, columns: Sequence[str]) -> tuple[tuple[str, ...], np.nd
 
 
 def _read_distance(sheet: Sheet, layout: Layout) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return distances (m,) and their sigmas (m,) [m]; sigmas are None if neither columns nor options contain them."""
+    """Return distances (m,) and their sigmas (m,) [m]; sigmas are None if neither columns nor options contain them.
+
+    Args:
+        sheet: the table with its options.
+        layout: the columns to read.
+    """
     distance = sheet.numbers(layout.distance[:1], DISTANCE)[:, 0]
     options = sheet.options.sigma
     if len(layout.distance) == 1 and options.distance is None:
@@ -160,7 +169,13 @@ def _check_pairs(table: Table, layout: Layout, group: np.ndarray, names: Sequenc
 
 
 def _links(sheet: Sheet, layout: Layout, group: np.ndarray) -> tuple[tuple[int, int, float], ...]:
-    """Return the pairs of groups that differ only in the socket's label, each with the known distance [m]."""
+    """Return the pairs of groups that differ only in the socket's label, each with the known distance [m].
+
+    Args:
+        sheet: the table with its options, which contain the known distances between sockets.
+        layout: the columns to read.
+        group: (m,) index of each row's group.
+    """
     table, options = sheet.table, sheet.options
     if options.socket_distance is None:
         return ()
@@ -261,7 +276,11 @@ def joint_columns(path: str | Path) -> tuple[str, ...]:
 
 
 def _select_rows(sheet: Sheet) -> Sheet:
-    """Return the sheet with only those rows that the option ``where`` selects."""
+    """Return the sheet with only those rows that the option ``where`` selects.
+
+    Args:
+        sheet: the table with its options.
+    """
     table = sheet.table
     keep = np.ones(len(table), dtype=bool)
     for name, values in sheet.options.where.items():

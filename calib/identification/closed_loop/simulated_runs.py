@@ -78,6 +78,10 @@ def nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tupl
 
     The robot is halfway, or nearer to `start` if that robot cannot be simulated.
 
+    Args:
+        start, end: robots with different parameters; `start` can be simulated.
+        cases: gap-free parts of recordings, each with its loop.
+
     Raises:
         CannotSimulate: if no robot near `start` can be simulated.
     """
@@ -92,7 +96,11 @@ def nearer(start: Plant, end: Plant, cases: Sequence[tuple[Case, Loop]]) -> tupl
 
 
 def distance_percent(runs: Runs) -> np.ndarray:
-    """Return the rms difference of simulated and recorded positions (n,), relative to the motion's rms [%]."""
+    """Return the rms difference of simulated and recorded positions (n,), relative to the motion's rms [%].
+
+    Args:
+        runs: simulations of the recordings' loops.
+    """
     n = runs[0][0][0].motion.n
     away, size = np.zeros((2, n))
     for (case, loop), run in runs:
@@ -105,7 +113,11 @@ def distance_percent(runs: Runs) -> np.ndarray:
 
 
 def error_ratio(runs: Runs) -> np.ndarray:
-    """Return the ratios (n,) of recorded to simulated tracking errors, by regression; NaN if noise hides the ratio."""
+    """Return the ratios (n,) of recorded to simulated tracking errors, by regression; NaN if noise hides the ratio.
+
+    Args:
+        runs: simulations of the recordings' loops.
+    """
     measured_errors = []
     expected_errors = []
     for (case, loop), run in runs:

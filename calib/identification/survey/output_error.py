@@ -186,6 +186,9 @@ class _Comparison:
     def simulated(self, values: np.ndarray) -> None:
         """Simulate all loops with parameters (p,), to check that this is possible.
 
+        Args:
+            values: (p,) parameters of the problem.
+
         Raises:
             CalibError: if a loop cannot be simulated.
         """
@@ -199,7 +202,11 @@ class _Comparison:
             plant.run(controller, loop.reference, Sensing(every=loop.every))
 
     def linearised(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return residuals (M, r), zero if not in use, and the Jacobian (M, r, p) of the simulated signals."""
+        """Return residuals (M, r), zero if not in use, and the Jacobian (M, r, p) of the simulated signals.
+
+        Args:
+            values: (p,) parameters, at which the signals are simulated.
+        """
         residuals = []
         slopes = []
         for (case, loop), drawn in zip(self.loops.pairs, self.noise, strict=True):
@@ -311,6 +318,10 @@ class _Comparison:
         """Return residuals (M r,) and Jacobian (M r, p), divided by std (r,).
 
         If the simulation fails, the residuals are huge and the Jacobian is zero.
+
+        Args:
+            values: (p,) parameters, at which the signals are simulated.
+            std: (r,) standard deviations of the residuals.
         """
         p = len(values)
         # residual of parameters that cannot be simulated: any step that can is better
@@ -323,7 +334,12 @@ class _Comparison:
         return (residual / std).ravel(), np.asfortranarray(scaled_slopes)
 
     def solved(self, values: np.ndarray, std: np.ndarray) -> nonlinear.Solution[np.ndarray]:
-        """Return the parameters that minimise the residuals divided by std (r,), with convergence."""
+        """Return the parameters that minimise the residuals divided by std (r,), with convergence.
+
+        Args:
+            values: (p,) first parameters.
+            std: (r,) standard deviations of the residuals.
+        """
         # at first
         first_damping = 1e-3
         # simulations with tangents per round
@@ -361,7 +377,12 @@ class _Comparison:
 
 
 def _gradient(residual: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Return the next Gauss–Newton step Qᵀ r (p,), in standard deviations of the estimate for white residuals."""
+    """Return the next Gauss–Newton step Qᵀ r (p,), in standard deviations of the estimate for white residuals.
+
+    Args:
+        residual: (M, r) residuals divided by their standard deviations.
+        slopes: (M, r, p) their Jacobian.
+    """
     p = slopes.shape[2]
     flat = slopes.reshape(-1, p)
     orthonormal, _ = np.linalg.qr(flat)
@@ -383,7 +404,7 @@ def _packed(
         plain: the least-squares estimate, for names and units.
         values: (p,) parameters.
         residual, slopes: (M, r) residuals and (M, r, p) Jacobian.
-        std: (r,) standard deviations.
+        std: (r,) standard deviations of the residuals [rad, m, N m or N].
 
     Raises:
         Unidentifiable: if the simulated motion does not distinguish parameters.
