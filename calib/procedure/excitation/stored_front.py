@@ -80,6 +80,8 @@ def read(folder: Path) -> StoredFront:
     """
     path = folder / TABLE
     require(path.is_file(), f"{folder} has no {TABLE}: design the motion with --front 5 first", UsageError)
+    message = f"{folder}: its front was made by a version that kept no motions; design it again"
+    require((folder / FOLDER).is_dir(), message, UsageError)
     damaged = f"{path} is damaged ({{}}); design the motion again"
     with refused_as(UsageError, (OSError, ValueError, MeasurementError), damaged):
         table = read_table(path)
