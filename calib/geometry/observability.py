@@ -288,7 +288,12 @@ class Observation:
         return point, self(q)[:, :3] * self.sigmas[0]
 
     def product(self, q: np.ndarray, G: np.ndarray) -> np.ndarray:
-        """Return Σ G[i] · ∂J[i]/∂q (m, n) for weights G (m, rows, p) of the whitened Jacobian J, in closed form."""
+        """Return Σ G[i] · ∂J[i]/∂q (m, n) for weights G (m, rows, p) of the whitened Jacobian J, in closed form.
+
+        Args:
+            q: (m, n) joint values [rad or m].
+            G: (m, rows, p) weights of the entries of J.
+        """
         chain = self.cell.chain
         count = len(chain.elements)
         # element of each parameter; -1 for the station, behind the last element for tools
