@@ -239,6 +239,7 @@ def identify_model(
         loop=settings.loop,
         cad=cad,
         constraints=settings.constraints,
+        progress=progress,
     )
     return _identified(problem, method, friction, settings, say)
 

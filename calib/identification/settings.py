@@ -39,7 +39,12 @@ class Coupling:
 @strict
 @dataclass(frozen=True)
 class Payload:
-    """A body at the flange: mass [kg] and centre of mass in the tip's frame [m]; None if unknown."""
+    """A body at the flange; None for what is unknown.
+
+    Attributes:
+        mass: its mass [kg]
+        com: its centre of mass in the tip's frame [m]
+    """
 
     mass: Annotated[float, Real(above=0, most=1e4, unit="kg")] | None = None
     com: Annotated[tuple[float, float, float], Expect("three numbers [m]")] | None = None

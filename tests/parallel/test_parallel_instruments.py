@@ -136,7 +136,7 @@ def test_impossible_simulation_is_said():
     model, values = truth(find("dualv").mechanism, "Ia Fv Fc")
     with pytest.raises(CannotSimulate, match="not positive definite"):
         model.plant(-values).run(gains("dualv", 1000.0, 8.0), asked("dualv", 0.2))
-    with pytest.raises(CannotSimulate, match="without v0 above 0"):
+    with pytest.raises(CannotSimulate, match="state its v0, above 0"):
         replace(model, terms=tuple(replace(x, settings=(0.0,) * len(x.settings)) for x in model.terms)).plant(
             values
         ).run(gains("dualv", 1000.0, 8.0), asked("dualv", 0.2))

@@ -213,7 +213,7 @@ NOT_THERE = ("empty.csv", "absent/load.csv", "--options", "options.toml", "--no-
     [
         (("identify", "dualv", "reversed.csv", "--validate", "other.csv", "--no-plots"), 1, "fail above 30 %"),
         (("fit", "dualv", "wrong.csv", "--validate", "poses.csv"), 1, "worse than the nominal"),
-        pytest.param(("identify", "dualv", *NOT_THERE), 0, "move as if it were absent", marks=pytest.mark.slow),
+        pytest.param(("identify", "dualv", *NOT_THERE), 0, "seems absent from its recordings", marks=pytest.mark.slow),
         pytest.param(("identify", "dualv", NOT_THERE[1], *NOT_THERE[2:]), 0, "record a run without it",
                      marks=pytest.mark.slow),
         *((words, 2, said) for words, said in (

@@ -9,6 +9,7 @@ import numpy as np
 
 from calib.controllers.table import as_described
 from calib.data.csv_table import Table
+from calib.data.poses import IGNORED, MEASURED
 from calib.data.poses.fit_options import FileOptions
 from calib.data.poses.measurements import KINDS
 from calib.data.schema import BOUNDS, Column
@@ -31,13 +32,19 @@ SIGMA_ROTATION = Column(
 )
 DISTANCE = Column(("distance",), "length", "distance", BOUNDS.max_length, "mm", positive="a distance must be above 0")
 SIGMA_DISTANCE = Column(("sigma_distance",), "length", "sigma", positive=SIGMA.positive)
-BASE = Column(("base_x", "base_y", "base_z", "base_qx", "base_qy", "base_qz", "base_qw"))
 LATE = Column(("late_x", "late_y", "late_z"), "speed", "late")
 TIME = Column(("time",), "time", "time")
 LABELS = ("distance", "pair", "bar", "socket", "plane", "tool")
 UNIT_GROUPS = ("joints", "position", "orientation", "distance", "sigma", "sigma_rotation")
-_FAMILIES = (POSITION, QUATERNION, MATRIX, TURNS, SIGMA, SIGMA_ROTATION, SIGMA_DISTANCE, BASE, LATE)
-OURS = (*(name for column in _FAMILIES for name in column.names), *LABELS)
+BASE_TIME = "base_time"
+_OF_FRAME = (POSITION, QUATERNION, MATRIX, TURNS, SIGMA, SIGMA_ROTATION)
+_FAMILIES = (*_OF_FRAME, SIGMA_DISTANCE, LATE)
+OURS = (
+    *(name for column in _FAMILIES for name in column.names),
+    *(f"base_{name}" for column in _OF_FRAME for name in column.names),
+    BASE_TIME,
+    *LABELS,
+)
 LABEL_OF = {"distance": "pair", "bar": "bar", "sockets": "socket", "plane": "plane"}
 _TARGET = re.compile(r"(sigma_)?[xyz]\d+")
 _NUMBERED_JOINT = re.compile(r"q\d+")
@@ -259,7 +266,8 @@ class Layout:
         distance: name of the distance column and, if present, of its sigma; () without a distance.
         tool: name of the column with tool labels; "" without one.
         group: names of the columns whose labels together identify a row's group.
-        base: seven names for position and quaternion of a frame on the robot's base, or none.
+        base: three names for the position of a frame on the robot's base, then those of its orientation; or none.
+        base_sigma, base_sigma_rotation: three names each for the sigmas of the base frame, or none.
         late: four names for the target's velocity and the time, or none.
         notes: remarks for the user on how the columns were chosen.
     """
@@ -274,6 +282,8 @@ class Layout:
     tool: str = ""
     group: tuple[str, ...] = ()
     base: tuple[str, ...] = ()
+    base_sigma: tuple[str, ...] = ()
+    base_sigma_rotation: tuple[str, ...] = ()
     late: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
@@ -281,7 +291,12 @@ class Layout:
     def used(self) -> frozenset[str]:
         """The file's names of all columns that are read."""
         families = (*self.positions, *self.sigmas, self.orientation, self.sigma_rotation, self.distance, self.group)
-        return frozenset().union(*families, self.joints, self.base, self.late, (self.tool,))
+        return frozenset().union(*families, self.joints, *self.of_base, self.late, (self.tool,))
+
+    @property
+    def of_base(self) -> tuple[tuple[str, ...], ...]:
+        """Names of the columns on the base frame, by family; empty tuples without a base frame."""
+        return self.base, self.base_sigma, self.base_sigma_rotation
 
 
 def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
@@ -317,6 +332,7 @@ def find_layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
 
 
 def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
+    _refuse_base_alone(sheet)
     columns = sheet.find_joints(joints)
     kind = _find_kind(sheet, columns)
     if kind in LABEL_OF:
@@ -325,11 +341,11 @@ def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
     if not positions:
         sheet.table.index("x")
     tool = sheet.find("tool")
-    base = sheet.family(BASE.names)
     late = sheet.family(LATE.names)
     if late:
         late = (*late, *TIME.names)
-    layout = Layout(kind, columns, positions, sigmas, tool=tool, base=base, late=late, notes=notes)
+    layout = Layout(kind, columns, positions, sigmas, tool=tool, late=late, notes=notes)
+    layout = _with_base(sheet, layout)
     if kind == "position":
         return layout
     orientation = _find_orientation(sheet, columns)
@@ -344,6 +360,56 @@ def _layout(sheet: Sheet, joints: Sequence[str]) -> Layout:
         notes = (*notes, f"the orientation is read from {', '.join(orientation)}{meaning}")
     rotation = sheet.family(SIGMA_ROTATION.names)
     return replace(layout, orientation=orientation, sigma_rotation=rotation, notes=notes)
+
+
+def _of_base(column: Column) -> list[str]:
+    return [f"base_{name}" for name in column.names]
+
+
+def _refuse_base_alone(sheet: Sheet) -> None:
+    """Raise MeasurementError for a file with base frames and without any target."""
+    base = _of_base(POSITION)
+    is_base = any(sheet.find(name) for name in base)
+    if not is_base or any(sheet.find(label) for label in LABEL_OF.values()):
+        return
+    if not _find_targets(sheet)[0]:
+        sheet.fail(
+            f"contains base frames ({', '.join(base)} …) and no target: a base frame is of use in the row of the "
+            "target that was measured with it; put both into the same rows, or join both by name or time (calib join)"
+        )
+
+
+def _with_base(sheet: Sheet, layout: Layout) -> Layout:
+    """Return a layout with the columns of the base frame, if the file has them and the options do not ignore them.
+
+    Raises:
+        MeasurementError: a base frame that is incomplete, or missing although the options require it.
+    """
+    if sheet.options.base_frame == IGNORED:
+        return layout
+    position = sheet.family(_of_base(POSITION))
+    orientation = sheet.family(_of_base(QUATERNION)) or sheet.family(_of_base(MATRIX))
+    if not orientation:
+        orientation = sheet.family(_of_base(TURNS))
+        if orientation and not sheet.options.euler:
+            sheet.fail("state in the options what these angles mean: euler = 'xyz fixed', 'vector' …", orientation[0])
+    if not position and not orientation:
+        if sheet.options.base_frame == MEASURED:
+            sheet.fail(
+                "has no base frame: columns base_x, base_y, base_z, base_qx, base_qy, base_qz, base_qw are needed in "
+                "the target's rows, not in a file apart; where it was not measured: reference = false in session.toml, "
+                "or base_frame = 'ignored' in the options"
+            )
+        return layout
+    if not position or not orientation:
+        needed = "base_x, base_y, base_z, and base_qx to base_qw, base_r11 to base_r33, or base_rx, base_ry, base_rz"
+        sheet.fail(f"the base frame is incomplete: it needs {needed}", (position or orientation)[0])
+    return replace(
+        layout,
+        base=(*position, *orientation),
+        base_sigma=sheet.family(_of_base(SIGMA)),
+        base_sigma_rotation=sheet.family(_of_base(SIGMA_ROTATION)),
+    )
 
 
 def _check_one_source(sheet: Sheet, position: Sequence[str], orientation: Sequence[str]) -> None:

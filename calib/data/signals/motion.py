@@ -53,6 +53,7 @@ ROWS = (
     "q_link",
     "q_ref",
     "tau_ff",
+    "q_measured",
     "v_measured",
 )
 
@@ -110,8 +111,8 @@ class Motion:
         velocity_cutoff: (n,) cut-off f_v of the positions from which v is computed [Hz].
         decimator: the filter of the parallel decimation to `band`.
         joint_names, kind, file, drive_gain, effort_variance: those of the recording.
-        tau_link, tau_motor, q_link, q_ref, tau_ff, v_measured: (N, n) further series of the recording on the grid, not
-            filtered; None if not recorded.
+        tau_link, tau_motor, q_link, q_ref, tau_ff, q_measured, v_measured: (N, n) further series of the recording on
+            the grid, not filtered; None if not recorded.
         sampling, cutoffs: reports of resampling and of the choice of cut-offs.
         notes: remarks for the user.
         jumps, faults: those of the recording.
@@ -141,6 +142,7 @@ class Motion:
     q_link: np.ndarray | None = None
     q_ref: np.ndarray | None = None
     tau_ff: np.ndarray | None = None
+    q_measured: np.ndarray | None = None
     v_measured: np.ndarray | None = None
     drive_gain: np.ndarray | None = None
     effort_variance: np.ndarray | None = None
@@ -248,8 +250,8 @@ def make_motion(
     rows = _span(mask)
     series: FieldValues = {}
     for name, values in sampled.series.items():
-        if name != "q":
-            series["v_measured" if name == "v" else name] = read_only(values[rows])
+        field = f"{name}_measured" if name in ("q", "v") else name
+        series[field] = read_only(values[rows])
     return Motion(
         t=read_only(sampled.t[rows]),
         q=read_only(q[rows]),

@@ -9,7 +9,7 @@ import numpy as np
 from calib.dynamics.drives import DriveTerm
 from calib.errors import CalibError, Finding, UsageError, finding
 from calib.estimation.triangles import Triangles
-from calib.identification.closed_loop.instrumental import Instrumental, identify_instrumental, sign_noise
+from calib.identification.closed_loop.instrumental import Instrumental, identify_instrumental
 from calib.identification.closed_loop.loop_recordings import ClosedLoops, close_loops
 from calib.identification.closed_loop.simulation import simulable
 from calib.identification.loop import LoopDisagreement, LoopMetrics, LoopResults
@@ -131,6 +131,7 @@ class _Simulated(Method):
                 positive=loop.positive,
                 terms=terms,
                 constraints=constraints,
+                say=problem.say,
             )
             simulations = 0
             for iteration in identification.rounds:
@@ -214,7 +215,7 @@ class LoopTest:
             return [finding("loop-test-failed", why=self.failure)]
         causes = _distance(self.found) or _gains(self.found) or _torques(self.found)
         noticed = [*_weakness(self.found), *causes]
-        return noticed + (_blurred(self.found, self.loops) if is_estimate else _biased(self.found))
+        return noticed if is_estimate else noticed + _biased(self.found)
 
 
 def compare_with_loop(problem: IdentificationProblem, estimate: MethodEstimate) -> LoopTest:
@@ -304,29 +305,6 @@ def _biased(identification: Instrumental) -> list[Finding]:
         return []
     names = [f"{identification.names[k]} by {shift[k]:.2g} σ" for k in np.argsort(-shift)[:5]]
     return [finding("least-squares-biased", p=identification.verdict.p, names=names)]
-
-
-def _blurred(identification: Instrumental, loops: ClosedLoops) -> list[Finding]:
-    """Return the finding that a joint's Coulomb sign is mainly velocity noise, which instruments cannot correct.
-
-    Args:
-        identification: estimate by instrumental variables.
-        loops: closed loops of the recordings.
-    """
-    if not identification.estimator.measured:
-        return []
-    # widths of the sign (our choice)
-    noise = sign_noise(identification.plant, loops.pairs[0][0].motion)
-    max_blur = 3.0
-    signs = [term for term in identification.plant.terms if term.shape == "sign"]
-    blurred = {}
-    for sign in signs:
-        joint = sign.acts[0][0]
-        blurred[sign.name] = noise[joint] / sign.settings[-1]
-    joints = [f"{size:.2g} at {name}" for name, size in blurred.items() if size > max_blur]
-    if joints:
-        return [finding("noisy-signs", joints=joints)]
-    return []
 
 
 # of both together, by which a parameter differs surely (our choice)
@@ -430,6 +408,13 @@ def _metrics(test: LoopTest, beside: bool) -> LoopMetrics:
             f"with the instruments of unbound parameters alone (Janot's form) the estimate is at most "
             f"{distance.max():.2g} σ away, at {identification.names[int(np.argmax(distance))]}",
         )
+    shares = np.array([noise.share for noise in identification.noise]).min(axis=0)
+    by_joint = ", ".join(f"{100 * share:.0f}" for share in shares)
+    notes = (
+        f"share of the position noise that the controller answers, by joint: {by_joint} %; Coulomb signs are averaged "
+        "over the noise, simulated in the loop by this share",
+        *notes,
+    )
     rounds = len(identification.rounds)
     largest_shift_sigma = float(identification.shift.max())
     least_partial_r2 = float(strength.partial_r2.min())

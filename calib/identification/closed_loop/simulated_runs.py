@@ -55,21 +55,17 @@ def regular_plant(
 
 
 def simulated_runs(plant: Plant, cases: Sequence[tuple[Case, Loop]]) -> Runs:
-    """Return noise-free simulations of the loops of all recordings.
+    """Return noise-free simulations of the loops of all recordings."""
+    return [((case, loop), simulated_run(plant, case, loop, Sensing(every=loop.every))) for case, loop in cases]
 
-    Args:
-        plant: the simulated robot.
-        cases: gap-free parts of recordings, each with its loop.
-    """
-    result: Runs = []
-    for case, loop in cases:
-        robot = plant.carrying(case.carried)
-        controller = loop.controller
-        if loop.design is not None:
-            controller = controller.scaled(robot.inertia_diagonal(loop.reference.q[::200]) / loop.design)
-        run = robot.run(controller, loop.reference, Sensing(every=loop.every))
-        result.append(((case, loop), run))
-    return result
+
+def simulated_run(plant: Plant, case: Case, loop: Loop, sensing: Sensing, seed: int = 0) -> SimulatedRun:
+    """Return the simulation of a recording's loop with the recording's payloads."""
+    robot = plant.carrying(case.carried)
+    controller = loop.controller
+    if loop.design is not None:
+        controller = controller.scaled(robot.inertia_diagonal(loop.reference.q[::200]) / loop.design)
+    return robot.run(controller, loop.reference, sensing, seed)
 
 
 def between(start: Plant, end: Plant, share: float) -> Plant:

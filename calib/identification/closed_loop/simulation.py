@@ -95,15 +95,15 @@ class Plant:
         factors = np.append(carried_columns, np.ones(len(self.terms)))
         return self.with_parameters(self.parameters * factors)
 
-    def run(self, controller: LoopController, reference: Reference, sensing: Sensing | None = None) -> SimulatedRun:
-        """Return the simulated motion of the robot that follows a reference, by `simulate` without a seed.
-
-        Args:
-            controller: the controller.
-            reference: reference sampled at the controller's rate.
-            sensing: noise, resolution and sampling; None: no noise, one sample per control period.
-        """
-        return simulate(self, controller, reference, sensing)
+    def run(
+        self,
+        controller: LoopController,
+        reference: Reference,
+        sensing: Sensing | None = None,
+        seed: int | np.random.Generator = 0,
+    ) -> SimulatedRun:
+        """Return the simulated motion of the robot that follows a reference, by `simulate`."""
+        return simulate(self, controller, reference, sensing, seed)
 
     def feed_forward(self, reference: Reference) -> np.ndarray:
         """Return the torques (N, n) of this model along a reference, drives included [N m or N]."""

@@ -66,6 +66,7 @@ class IdentificationProblem:
             unknown.
         constraints: constraints of the options, for methods that support them; None: the defaults.
         start: (p,) start values of methods that simulate; None: least squares, if that robot can be simulated.
+        progress: called with a short text at each round of a method that simulates; None: not called.
     """
 
     model: RegressorModel
@@ -81,9 +82,15 @@ class IdentificationProblem:
     cad: np.ndarray | None = None
     constraints: ConstraintSettings | None = None
     start: np.ndarray | None = None
+    progress: Callable[[str], None] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "groups", frozen(self.groups, int))
+
+    def say(self, text: str) -> None:
+        """Call `progress`, if there is one, with a short text."""
+        if self.progress is not None:
+            self.progress(text)
 
     @cached_property
     def pooled(self) -> Triangles:

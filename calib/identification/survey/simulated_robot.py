@@ -34,7 +34,7 @@ from calib.records import frozen, shaped
 
 @dataclass(frozen=True, eq=False)
 class Sensitivities:
-    """Simulated noise-free motion of M samples, and its derivatives by c parameters.
+    """Simulated motion of M samples, and its derivatives by c parameters.
 
     Attributes:
         t: (M,) times [s].
@@ -58,8 +58,9 @@ def simulate_tangents(
     columns: np.ndarray,
     every: float = 1,
     relative: np.ndarray | None = None,
+    noise: np.ndarray | None = None,
 ) -> Sensitivities:
-    """Return a noise-free simulated motion along a reference, with exact derivatives by the parameters.
+    """Return a simulated motion along a reference, with exact derivatives by the parameters.
 
     Args:
         plant: robot whose friction depends on position and velocity alone.
@@ -69,6 +70,7 @@ def simulate_tangents(
         every: control periods per sample.
         relative: (n, c) derivatives of the logarithm of all gains of a joint by the parameters, if the gains depend on
             them (`calib.identification.closed_loop.loop_recordings.Loop.design`); None: the gains are constant.
+        noise: (N, n) noise of the measured positions, on which the controller acts [rad or m]; None: none.
 
     Raises:
         CannotSimulate: if the inertia matrix is not positive definite, or friction too stiff.
@@ -106,6 +108,7 @@ def simulate_tangents(
         controller.rows,
         scale,
         reference.sampled(controller.ahead),
+        np.empty((0, n)) if noise is None else np.ascontiguousarray(shaped(noise, reference.q.shape, "noise")),
         reference.period,
         controller.smoothing(reference.period),
         controller.delay,
@@ -289,6 +292,7 @@ class BelievedRobot:
         reference: Reference,
         every: float,
         relative: np.ndarray | None = None,
+        noise: np.ndarray | None = None,
     ) -> Sensitivities:
         """Return the simulated motion with parameters (p,) and its derivatives by them.
 
@@ -301,11 +305,12 @@ class BelievedRobot:
             reference: reference sampled at the controller's rate.
             every: control periods per sample.
             relative: (n, p) derivatives of the logarithm of the gains by the parameters; None: the gains are constant.
+            noise: (N, n) noise of the measured positions [rad or m]; ignored for a robot without tangents.
         """
         plant = self.at(values, case)
         if self.steps is not None:
             return simulate_differences(plant, controller, reference, self.columns, self.steps, every)
-        sensitivities = simulate_tangents(plant, controller, reference, self.columns, every, relative)
+        sensitivities = simulate_tangents(plant, controller, reference, self.columns, every, relative, noise)
         carried = self.carried(case)
         by_q = sensitivities.by_q * carried
         by_v = sensitivities.by_v * carried

@@ -462,27 +462,13 @@ def _command_tangent(
 
 @njit(**OPTIONS)
 def closed_loop_tangent(
-    plant, layout, model, gains, relative, reference, period, smoothing, late, every, q, v, count, out, dout
+    plant, layout, model, gains, relative, reference, encoder, period, smoothing, late, every, q, v, count, out, dout
 ):
-    """Write the noise-free motion of `loop_kernels.closed_loop` and its tangents; return a status and a period.
+    """Write the motion of `loop_kernels.closed_loop` and its tangents; return a status and a period.
 
-    The period is the index of the last one reached.
-
-    Args:
-        plant: arrays tree, body, linear, kinds, acts of `loop_kernels`.
-        layout: index arrays order, entries, shares, owners, find.
-        model: array `body` of the controller's model; 0 rows if there is none.
-        gains: (6, n) controller values, as in `loop_kernels.closed_loop`.
-        relative: (n, c) derivatives of the logarithm of each joint's gains by the parameters; zero for constant gains.
-        reference: (4, N, n) position, velocity, feedforward torque, feedforward acceleration.
-        period: control period [s].
-        smoothing: weight of a new velocity sample in the controller's low-pass.
-        late: delay in control periods.
-        every: control periods per sample.
-        q, v: (n,) the state, which is overwritten.
-        count: number of control periods.
-        out: (3, M, n) q, v and torque at each sample.
-        dout: (3, M, n, c) their tangents, i.e. derivatives by the parameters.
+    The period is the number of the last one reached. relative (n, c): derivatives of the logarithm of each joint's
+    gains by the parameters; zero for constant gains. `out` (3, M, n): q, v, torque every `every` periods. `dout` (3, M,
+    n, c): their tangents. encoder (N, n) or (0, n): noise of the measured positions, on which the controller acts.
     """
     tree, linear, kinds = plant[0], plant[2], plant[3]
     n, c = relative.shape
@@ -491,19 +477,22 @@ def closed_loop_tangent(
     rooms, empty = _workspace(tree.shape[0], n, c), np.empty(0, dtype=np.int64)
     memory, loads = np.zeros((kinds.shape[0], 2)), np.zeros(n)
     speed, before, integral, wish, feedback = np.zeros(n), np.empty(n), np.zeros(n), np.empty(n), np.empty(n)
-    tau, waiting = np.empty(n), np.zeros((late + 1, n))
+    tau, waiting, read = np.empty(n), np.zeros((late + 1, n)), np.empty(n)
     dq, dv, dspeed, dbefore = np.zeros((n, c)), np.zeros((n, c)), np.zeros((n, c)), np.zeros((n, c))
     dintegral, dwish, dtau, dwaiting = np.zeros((n, c)), np.zeros((n, c)), np.zeros((n, c)), np.zeros((late + 1, n, c))
     sample = 0
     for k in range(count):
+        read[:] = q
+        if encoder.shape[0]:
+            read += encoder[k]
         if k == 0:
             speed[:] = v
         else:
             for j in range(n):  # rounded as in `loop_kernels.closed_loop`
-                speed[j] += smoothing * ((q[j] - before[j]) / period - speed[j])
+                speed[j] += smoothing * ((read[j] - before[j]) / period - speed[j])
             dspeed += smoothing * ((dq - dbefore) / period - dspeed)
-        before[:], dbefore[:] = q, dq
-        command(gains, reference[0, k], reference[1, k], q, speed, integral, period, feedback)
+        before[:], dbefore[:] = read, dq
+        command(gains, reference[0, k], reference[1, k], read, speed, integral, period, feedback)
         for j in range(n):
             if abs(integral[j]) < gains[5, j]:
                 dintegral[j] -= period * dq[j]
@@ -517,7 +506,7 @@ def closed_loop_tangent(
             gains,
             relative,
             reference[3, k],
-            q,
+            read,
             speed,
             dq,
             dspeed,
@@ -531,12 +520,12 @@ def closed_loop_tangent(
         )
         wish[:] = feedback
         if model.shape[0]:
-            linearise_command(tree, model, linear, reference[3, k], q, speed, work, matrix, wish)
+            linearise_command(tree, model, linear, reference[3, k], read, speed, work, matrix, wish)
         wish += reference[2, k]
         now, old = k % (late + 1), (k + 1) % (late + 1) if k >= late else 0
         for j in range(n):
             held = min(max(wish[j], -gains[4, j]), gains[4, j])
-            error = reference[0, k, j] - q[j]
+            error = reference[0, k, j] - read[j]
             if held != wish[j] and error * wish[j] > 0.0:
                 integral[j] -= period * error
                 dintegral[j] += period * dq[j]

@@ -607,13 +607,8 @@ def deflection_sensitivity(found: Identification, robot: CalibratedChain, cases:
 
         dφ/dc = -(Wᵀ R⁻¹ W)⁻¹ Wᵀ R⁻¹ Σ_s ∂τ/∂s b_s,    s one of q, v, a of the joint, b_s the basis or its derivative
 
-    with W the observation matrix, R the variances of its rows, τ the torques; as in `sensitivity`, but without the part
-    that is proportional to the residual.
-
-    Args:
-        found: the identification.
-        robot: its robot, with joint corrections.
-        cases: training data of the identification, with the motion of the links.
+    as in `sensitivity`, but without the part that is proportional to the residual. A model without bodies (rows
+    ``drive``) feels no deflection.
     """
     terms = robot.deflection
     chain = robot.complete
@@ -626,6 +621,8 @@ def deflection_sensitivity(found: Identification, robot: CalibratedChain, cases:
     base_values = found.fitted.estimate.values[: found.base.b]
     standard = found.base.to_standard(base_values)[: model.inertial]
     pull = np.zeros((len(inverse), len(terms.terms)))
+    if not model.inertial:
+        return pull
     seen = 0
     every = -(-sum(len(case.motion) for case in cases) // DEFLECTION_SAMPLES)
     for rows, case in zip(found.rows, cases):
