@@ -54,8 +54,8 @@ def energies(bodies: Bodies, q: np.ndarray, v: np.ndarray) -> np.ndarray:
 
         ½ q̇ᵀ [Y(q, 0, q̇) - Y(q, 0, 0)] - [0, gᵀ R, gᵀ p],    R, p: pose of the body's frame in the base
 
-    Here g is the gravity vector and Y the regressor of the torques, so that M(q) q̇ = [Y(q, 0, q̇) - Y(q, 0, 0)] chi for
-    the inertia matrix M and standard parameters chi (Gautier 1997).
+    Here g is the gravity vector and Y the regressor of the torques, so that M(q) q̇ = [Y(q, 0, q̇) - Y(q, 0, 0)] chi
+    for the inertia matrix M and standard parameters chi (Gautier 1997).
 
     Args:
         bodies: the B bodies of the robot.

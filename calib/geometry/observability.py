@@ -297,7 +297,11 @@ class Observation:
         return np.sqrt(squares)
 
     def position(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the position of the first target (m, 3) [m] and its unwhitened Jacobian (m, 3, p)."""
+        """Return the position of the first target (m, 3) [m] and its unwhitened Jacobian (m, 3, p).
+
+        Args:
+            q: (m, n) joint values [rad or m].
+        """
         point = see(self.cell, q).point
         sigma = self._sigma(point)[:3]
         return point.T, self(q)[:, :3] * sigma.T[:, :, None]
