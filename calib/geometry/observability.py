@@ -246,7 +246,7 @@ def base_columns(
         cell: the installation.
         blocks: prepared measurements.
         columns: (c,) indices of the candidate parameters.
-        tolerance: relative size below which a column is treated as dependent.
+        tolerance: norm of a column's independent part, relative to the column, below which it counts as dependent.
     """
     return split_columns(observation_matrix(cell, blocks, columns), _preference(cell, columns), tolerance)
 

@@ -419,7 +419,7 @@ class _FoldRows:
     def _observed_shares(
         self, number: int, rows: np.ndarray
     ) -> tuple[list[Share], list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
-        """Return the statistics of whitened rows; for rows in metres, return residual, W and weights of each part.
+        """Return the statistics of whitened rows; for rows in metres, return residual, Jacobian and weights of each part.
 
         Args:
             number: index of the block.
