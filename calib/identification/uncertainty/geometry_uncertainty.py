@@ -660,8 +660,8 @@ def _torque_slopes(bodies: Bodies, values: np.ndarray, states: Sequence[np.ndarr
     Args:
         bodies: the robot's bodies.
         values: (10 B,) standard parameters.
-        states: q, v, a, (N, n) each.
-        joint: joint j.
+        states: q, v, a, (N, n) each [rad or m, and per s, per s²].
+        joint: index of joint j, from 0.
     """
     result = np.zeros((3, *states[0].shape))
     for order in range(3):
