@@ -43,9 +43,9 @@ def exchanged_by_index(
 
     For O2-O5 and cond there is no determinant lemma: each set tried costs the eigenvalues of a p × p matrix. Only two
     groups of candidates are therefore tried for each member: those with the largest first-order gain tr(J_i G J_iᵀ), G
-    = ∂ log O / ∂M, and those with the largest tr(J_i M⁻² J_iᵀ). The second is the gain of A-optimality, which also
-    works where several singular values equal the smallest one. These two groups and their size are our choice; the
-    result is a local optimum among the exchanges tried only.
+    = ∂ log O / ∂M with M the information matrix of the set, and those with the largest tr(J_i M⁻² J_iᵀ). The second is
+    the gain of A-optimality, which also works where several singular values equal the smallest one. These two groups
+    and their size are our choice; the result is a local optimum among the exchanges tried only.
 
     Args:
         jacobians: (N, rows, p) Jacobians J_i of the N candidates, each row divided by its standard deviation.
