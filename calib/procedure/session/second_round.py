@@ -146,9 +146,7 @@ def _short_joints(session: Session, tolerance: float) -> list[_ShortParameter]:
     """
     report = session.identification.unseen.read()
     recordings = (report.proofs or report.fit).values()
-    errors_in_motion = []
-    for recording in recordings:
-        errors_in_motion.append(recording.counted(recording.floor_dominates))
+    errors_in_motion = [recording.counted(recording.floor_dominates) for recording in recordings]
     worst = max(errors_in_motion, key=attrgetter("total"))
     if not tolerance or worst.total <= tolerance:
         return []
