@@ -213,6 +213,10 @@ def regrouping(base: Base) -> dict[str, dict[str, float]]:
 def from_table(chain: Chain, table: ParsedTable) -> Dynamics:
     """Return the model of a chain from a table of `to_table`.
 
+    Args:
+        chain: the arm.
+        table: the content of ``dynamics.json``.
+
     Raises:
         KeyError, TypeError, ValueError, IndexError: for a damaged table.
     """
