@@ -1,10 +1,11 @@
 """Dynamics: regressor models, base parameters, drives, identification problems and methods."""
 
-from calib.dynamics.base import Base, regroup, standard_name
+from calib.dynamics.base import Base, BaseModel, regroup, standard_name
 from calib.dynamics.base import find as find_base
 from calib.dynamics.bodies import bodies_of, standard_parameters, with_payload
 from calib.dynamics.drives import term as drive_term
 from calib.dynamics.idim import IdentificationModel
+from calib.dynamics.load_cases import LoadCases
 from calib.dynamics.pseudo_inertia import ball, margin
 from calib.dynamics.torque_rows import BOTH, LINK, MOTOR, POWER, ROWS, TorqueRows
 from calib.identification.methods.constraint_settings import ConstraintSettings
@@ -27,6 +28,7 @@ __all__ = [
     "ROWS",
     "VERSIONS",
     "Base",
+    "BaseModel",
     "Case",
     "ConstraintSettings",
     "Dynamics",
@@ -34,6 +36,7 @@ __all__ = [
     "IdentificationModel",
     "IdentificationProblem",
     "IdentificationSettings",
+    "LoadCases",
     "Method",
     "MethodEstimate",
     "TorqueRows",

@@ -30,18 +30,16 @@ from calib import files
 from calib.data.signals.filtering import decimate
 from calib.dynamics.torque_rows import torque_rows
 from calib.errors import TaskLost
-from calib.geometry.weighing import calibrated_chain
 from calib.identification.identify import chain_states, common_decimator, find_base
 from calib.identification.uncertainty import geometry_uncertainty
 from calib.simulation import known_robots
-from calib.simulation.virtual_cells import lwr4plus_cell
 from calib.toolkit.chains import CalibratedChain, Chain, random_joints
+from calib.toolkit.installations import calibrated_chain, install
 from calib.toolkit.installations import fit_installation as fit
-from calib.toolkit.installations import install
 from calib.toolkit.model_identification import Identification, identify
 from calib.toolkit.recordings import FilterOptions, Recording, make_motion
 from calib.toolkit.sessions import Payload
-from calib.toolkit.simulations import Cell, Reference, SimulatedInstrument, measure, random_fourier
+from calib.toolkit.simulations import Cell, Reference, SimulatedInstrument, lwr4plus_cell, measure, random_fourier
 from calib.toolkit.torque_models import Case, IdentificationSettings, make_case, make_model, standard_parameters
 from calib.workers import workers
 

@@ -31,12 +31,11 @@ from calib import files
 from calib.dynamics import base as bases
 from calib.dynamics.torque_rows import MODELS
 from calib.estimation.essential import Elimination, Rule, eliminate
-from calib.identification.closed_loop.simulation import tracking_error
 from calib.procedure.excitation import coefficients
 from calib.simulation import lwr4plus
 from calib.toolkit.chains import Chain
 from calib.toolkit.report_charts import AFTER, INK, PAGE_WIDTH, QUIET, save, sheet, styled
-from calib.toolkit.simulations import Plant, Reference, feed_forward, random_fourier
+from calib.toolkit.simulations import Plant, Reference, feed_forward, random_fourier, tracking_error
 from calib.toolkit.statistics import LinearFit, settled_std, wls
 from calib.toolkit.torque_models import BOTH, MOTOR, Base, IdentificationModel, TorqueRows, observe
 

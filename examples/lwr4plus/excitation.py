@@ -42,9 +42,7 @@ from simulated_arm import PAYLOAD, TABLE_4, Data, collected, model, nominal_base
 from calib import files
 from calib.api.motions import ExcitationDesign
 from calib.dynamics import base as bases
-from calib.dynamics.load_cases import LoadCases
 from calib.estimation.triangles import combine
-from calib.geometry.weighing import calibrated_chain
 from calib.procedure.excitation import coefficients
 from calib.procedure.excitation.design import Designed, search_motion
 from calib.procedure.excitation.excited_model import excited_model
@@ -53,14 +51,13 @@ from calib.procedure.excitation.limits import read_motion_limits
 from calib.procedure.excitation.settings import ExcitationSettings
 from calib.robot.tables import dumps
 from calib.simulation import lwr4plus
-from calib.simulation.virtual_cells import lwr4plus_cell
 from calib.toolkit.chains import Chain, random_joints
+from calib.toolkit.installations import calibrated_chain, install
 from calib.toolkit.installations import fit_installation as fit
-from calib.toolkit.installations import install
 from calib.toolkit.report_charts import save
-from calib.toolkit.simulations import Reference, measure
+from calib.toolkit.simulations import Reference, lwr4plus_cell, measure
 from calib.toolkit.statistics import settled_std, wls
-from calib.toolkit.torque_models import BOTH, MOTOR, Base, IdentificationModel
+from calib.toolkit.torque_models import BOTH, MOTOR, Base, IdentificationModel, LoadCases
 from calib.trajectories.design.objectives import condition_numbers
 from calib.workers.threads import one_blas_thread
 

@@ -32,13 +32,11 @@ from calib.poses.whole_space import bound_over_space
 from calib.robot import mdh
 from calib.robot.kinematics import jacobian, jacobian_product
 from calib.simulation import lwr4plus
-from calib.simulation.cell import true_poses
-from calib.simulation.virtual_cells import lwr4plus_cell
 from calib.toolkit.chains import Chain, random_joints
 from calib.toolkit.installations import Installation, install, prepare, see
 from calib.toolkit.installations import fit_installation as fit
 from calib.toolkit.pose_data import Positions
-from calib.toolkit.simulations import SimulatedInstrument, measure, rigid
+from calib.toolkit.simulations import SimulatedInstrument, lwr4plus_cell, measure, rigid, true_poses
 from calib.transforms import invert
 
 LIMITS = np.deg2rad([170.0, 120.0, 170.0, 120.0, 170.0, 90.0, 170.0])
