@@ -3,13 +3,16 @@
 # pyright: reportAttributeAccessIssue=false
 # clarabel is a compiled extension without stubs
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg
 
 from calib.errors import NotConverged
+from calib.estimation.convex_sets import ConvexSet
 from calib.estimation.triangles import require_rank
 
 if TYPE_CHECKING:
@@ -26,12 +29,17 @@ MAX_MOVE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class ConeOptimum:
-    """Optimum b (p,) of a cone program, with multipliers of its rows (c,), matrices (k, n, n) and equalities (e,)."""
+    """Optimum b (p,) of a cone program, with multipliers of its rows (c,), matrices (k, n, n) and equalities (e,).
+
+    Attributes:
+        sets: multipliers (k,) of each convex set's rows.
+    """
 
     values: np.ndarray
     rows: np.ndarray
     matrices: np.ndarray
     equalities: np.ndarray
+    sets: tuple[np.ndarray, ...] = ()
 
 
 def minimise(
@@ -43,8 +51,9 @@ def minimise(
     least: np.ndarray | float = 0.0,
     equality_rows: np.ndarray | None = None,
     equality_values: np.ndarray | None = None,
+    sets: Sequence[ConvexSet] = (),
 ) -> ConeOptimum:
-    """Minimise ½ ‖R b - z‖² under A b + c >= 0, E b = d and M_k(b) ⪰ λ 1; no squares are formed.
+    """Minimise ½ ‖R b - z‖² under A b + c >= 0, E b = d, M_k(b) ⪰ λ 1 and b in convex sets; no squares are formed.
 
     t = R b - z is added to the unknowns.
 
@@ -54,6 +63,7 @@ def minimise(
         matrices: (k, n, n, p) coefficients A_kj of M_k = Σ_j A_kj b_j.
         least: λ, one number or (k,).
         equality_rows, equality_values: E (e, p), d (e,); None without equalities.
+        sets: convex sets of b.
 
     Raises:
         NotConverged: where no point satisfies all constraints.
@@ -71,22 +81,32 @@ def minimise(
     weight = np.where(i == j, 1.0, np.sqrt(2.0))
     flat = (matrices[:, i, j] * weight[:, None]).reshape(-1, p)
     bounds = -np.outer(np.broadcast_to(least, size), i == j).ravel()
-    system = np.vstack([upper, equality_rows, -rows, -flat])
-    right = np.concatenate([target, equality_values, offset, bounds])
-    end_of_target, end_of_equalities, end_of_rows = np.cumsum([m, len(equality_rows), len(rows)]).tolist()
+    set_rows = [convex.matrix for convex in sets]
+    set_sides = [convex.sides for convex in sets]
+    system = np.vstack([upper, equality_rows, -rows, -flat, *set_rows])
+    right = np.concatenate([target, equality_values, offset, bounds, *set_sides])
+    ends = np.cumsum([m, len(equality_rows), len(rows), len(flat), *map(len, set_sides)]).tolist()
+    end_of_target, end_of_equalities, end_of_rows, end_of_matrices = ends[:4]
     cones = [clarabel.ZeroConeT(end_of_equalities)]
     if len(rows):
         cones.append(clarabel.NonnegativeConeT(len(rows)))
     cones += [clarabel.PSDTriangleConeT(n)] * size
+    for convex in sets:
+        cones += convex.cones
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_threads = 1
-    cost = sparse.diags(np.repeat([0.0, 1.0], [p, m])).tocsc()
-    system = sparse.csc_matrix(np.hstack([system, -np.eye(len(system), m)]))
+    set_unknowns: list[np.ndarray] = [convex.further for convex in sets]
+    further = np.asarray(scipy.linalg.block_diag(np.zeros((end_of_matrices, 0)), *set_unknowns))
+    further_count = further.shape[1]
+    cost = sparse.diags(np.repeat([0.0, 1.0, 0.0], [p, m, further_count])).tocsc()
+    system = sparse.csc_matrix(np.hstack([system, -np.eye(len(system), m), further]))
     solution = None
     for accuracy in ACCURACIES:
         settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = accuracy
-        solution = _solved(clarabel.DefaultSolver(cost, np.zeros(p + m), system, right, cones, settings))
+        solution = _solved(
+            clarabel.DefaultSolver(cost, np.zeros(p + m + further_count), system, right, cones, settings)
+        )
         if solution is not None and str(solution.status) in FINAL:
             break
     if solution is None:
@@ -96,13 +116,15 @@ def minimise(
         raise NotConverged(f"the constraints may contradict each other: Clarabel reports {solution.status}", values)
     dual = np.array(solution.z)
     matrix_multipliers = np.zeros((size, n, n))
-    matrix_multipliers[:, i, j] = dual[end_of_rows:].reshape(size, len(i)) / weight
+    matrix_multipliers[:, i, j] = dual[end_of_rows:end_of_matrices].reshape(size, len(i)) / weight
     matrix_multipliers[:, j, i] = matrix_multipliers[:, i, j]
+    set_multipliers = [dual[start:end] for start, end in pairwise(ends[3:])]
     return ConeOptimum(
         values=values,
         rows=dual[end_of_equalities:end_of_rows],
         matrices=matrix_multipliers,
         equalities=-dual[end_of_target:end_of_equalities],
+        sets=tuple(set_multipliers),
     )
 
 
