@@ -84,8 +84,10 @@ class Parameters:
             refuse_option(WHERE, f'beta[{names!r}]: expected names of parameters: beta["M3"], beta["MX2", "MY2"]')
         if names not in self._variables:
             rows = [self._row_of({name: 1.0}) for name in listed]
-            shape = () if isinstance(names, str) else (len(listed),)
-            variable = cvxpy.Variable(shape, name=", ".join(listed))
+            if isinstance(names, str):
+                variable = cvxpy.Variable(name=names)
+            else:
+                variable = cvxpy.Variable(len(listed), name=f"({', '.join(listed)})")
             self._variables[names] = variable
             self._rows[variable.id] = np.array(rows)
         return self._variables[names]
